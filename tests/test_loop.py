@@ -12,6 +12,7 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.run import RunResult
 from bampipe.run import models, pipeline
 from bampipe.run.events import ignore_event
+from bampipe.run.request import Request
 
 
 def made(settings: dict[str, object]) -> dict[str, object]:
@@ -52,7 +53,7 @@ def test_following_judges_the_model_that_it_starts_from(
     found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
     monkeypatch.setattr(loop.LoopOptions, "run", lambda _, *steps: ran.append(steps))
     monkeypatch.setattr(loop.RunFolder, "read", lambda *_: found)
-    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, ignore_event)
+    options = loop.LoopOptions(Request(tmp_path, pipeline.load()), ignore_event)
     lines: list[str] = []
     assert loop.follow(options, "base", lines.append) == "base"
     assert lines == ["base, joint: unknown effect"]
@@ -106,7 +107,7 @@ def test_a_child_that_was_never_identified_is_removed(
 
     write_result(tmp_path, IngestResult, device="slider", axes={"carriage": {}})
     monkeypatch.setattr(loop.LoopOptions, "run", run)
-    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, ignore_event)
+    options = loop.LoopOptions(Request(tmp_path, pipeline.load()), ignore_event)
     with pytest.raises(fault):
         loop.extend(options, "base", ["stribeck:carriage"])
     assert models.names(tmp_path) == ("base",)
@@ -120,7 +121,7 @@ def test_identification_starts_where_the_diagnosis_ended_if_it_fitted_all(
     write_result(tmp_path, IngestResult, device="slider", axes={"carriage": {}})
     write_result(tmp_path, DiagnoseResult, model="base", **content, fitted=fitted)
     monkeypatch.setattr(loop.LoopOptions, "run", lambda *_: None)
-    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, ignore_event)
+    options = loop.LoopOptions(Request(tmp_path, pipeline.load()), ignore_event)
     for effects, start in (
         (("stribeck:carriage",), {"stribeck.carriage.speed": 0.02}),
         (("stribeck:carriage", "quadratic_drag:carriage"), {}),
@@ -148,7 +149,7 @@ def test_what_came_to_nothing_is_not_weighed_again(
     monkeypatch.setattr(loop.RunFolder, "read", diagnosed)
     monkeypatch.setattr(loop, "_add", lambda *_: "")
     lines: list[str] = []
-    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, ignore_event)
+    options = loop.LoopOptions(Request(tmp_path, pipeline.load()), ignore_event)
     assert loop.follow(options, "base", lines.append) == "base"
     assert lines == [
         *(f"base, joint: missing {name} (> 0.99)" for name in left),

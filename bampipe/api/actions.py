@@ -1,6 +1,7 @@
 """The stages as functions, which share the cache of the command line."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,7 @@ def extend(run: Run | Path_, effect: str | Sequence[str], model: str = "") -> Ru
     """
     opened = _open(run)
     effects = (effect,) if isinstance(effect, str) else tuple(effect)
-    loop.extend(_make_options(opened), model or opened.model, effects)
+    loop.extend(_options(opened), model or opened.model, effects)
     return Run(opened.root)
 
 
@@ -137,7 +138,7 @@ def follow(run: Run | Path_, model: str = "") -> Run:
         The run, whose `Run.model` is the best one found.
     """
     opened = _open(run)
-    loop.follow(_make_options(opened), model or opened.model, lambda line: None)
+    loop.follow(_options(opened), model or opened.model, lambda line: None)
     return Run(opened.root)
 
 
@@ -145,9 +146,10 @@ def _open(run: Run | Path_) -> Run:
     return run if isinstance(run, Run) else open_run(run)
 
 
-def _make_options(run: Run) -> loop.LoopOptions:
+def _options(run: Run) -> loop.LoopOptions:
+    """Return the request for any stage of a run, and a listener that does nothing."""
     batch.limit_threads(1)
-    return loop.LoopOptions(run.root, pipelines.whole(run.root), False, True, ignore_event)
+    return loop.LoopOptions(Request(run.root, pipelines.whole(run.root)), ignore_event)
 
 
 def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object) -> dict[str, Any]:
@@ -170,17 +172,8 @@ def _run_stage(
     run: Run | Path_, stage: str, model: str, settings: Mapping[str, object]
 ) -> tuple[Run, list[dict[str, Any]]]:
     """Run one stage, for one model or each; return the run with its results, and summaries."""
-    root = _open(run).root
-    batch.limit_threads(1)
-    outcome = runner.run_session(
-        Request(
-            root=root,
-            pipeline=pipelines.whole(root),
-            settings={stage: settings} if settings else {},
-            first=stage,
-            last=stage,
-            model=model,
-        ),
-        ignore_event,
-    )
-    return Run(root), [step.summary for step in outcome.steps]
+    changed = {stage: settings} if settings else {}
+    request = _options(_open(run)).request
+    request = replace(request, settings=changed, first=stage, last=stage, model=model)
+    outcome = runner.run_session(request, ignore_event)
+    return Run(request.root), [step.summary for step in outcome.steps]

@@ -3,13 +3,12 @@
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model import ModelFile
-from bampipe.declarations.pipeline import Pipeline
 from bampipe.errors import InputError
 from bampipe.files import is_normal, write_text
 from bampipe.lists import join_names
@@ -29,17 +28,14 @@ MOST_ROUNDS = 4
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """Options of all steps of the loop, as in `Request`."""
+    """The request that all steps of the loop share, and the listener to their events."""
 
-    root: Path
-    pipeline: Pipeline
-    force: bool
-    wait: bool
+    request: Request
     listen: Listener
 
     def lock(self) -> AbstractContextManager[None]:
         """Return a lock on the run folder; do not hold it during :meth:`run`."""
-        return record.lock(self.root, self.wait, self.listen)
+        return record.lock(self.request.root, self.request.wait, self.listen)
 
     def run(
         self,
@@ -49,22 +45,11 @@ class LoopOptions:
         changed: Mapping[str, Mapping[str, object]] = MappingProxyType({}),
     ) -> None:
         """Run the stages ``first`` to ``last`` on ``model``, with some settings ``changed``."""
-        settings = settings_of(self.root, model)
+        settings = settings_of(self.request.root, model)
         for stage, values in changed.items():
             settings[stage] = {**settings.get(stage, {}), **values}
-        run_session(
-            Request(
-                root=self.root,
-                pipeline=self.pipeline,
-                first=first,
-                last=last,
-                model=model,
-                settings=settings,
-                force=self.force,
-                wait=self.wait,
-            ),
-            self.listen,
-        )
+        step = replace(self.request, first=first, last=last, model=model, settings=settings)
+        run_session(step, self.listen)
 
 
 def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
@@ -141,7 +126,7 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
         InputError: the parent or an effect does not exist, the device cannot have the effect, or
             the parent has it already. No files remain.
     """
-    root = options.root
+    root = options.request.root
     drafts = list_drafts(root, parent)
     named = dict(_find_effect(effect, drafts) for effect in effects)
     child = models.child_name(parent, tuple(named))
@@ -152,7 +137,7 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
             )
     try:
         with options.lock():
-            models.ensure_base(root, *options.pipeline.base_model)
+            models.ensure_base(root, *options.request.pipeline.base_model)
             _write_child(root, parent, named)
         options.run("identify", "validate", parent)
         options.run("identify", "validate", child)
@@ -166,7 +151,7 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
 
 def _remove(options: LoopOptions, model: str) -> None:
     """Remove a model."""
-    folder = options.root / "models" / model
+    folder = options.request.root / "models" / model
     if folder.exists():
         with options.lock():
             shutil.rmtree(folder)
@@ -214,7 +199,7 @@ def follow(
     Returns:
         The name of the last model that is better than its parent.
     """
-    run, given = RunFolder(options.root), model
+    run, given = RunFolder(options.request.root), model
     options.run("identify", "validate", model)  # the ladder compares each child with it
     left_out: dict[str, dict[str, object]] = {}
     for _ in range(MOST_ROUNDS):
@@ -267,7 +252,8 @@ def _add(
     """Extend ``model`` by the effects with a strength; return "" if it does not improve."""
     tell(f"adding {', '.join(effects)}")
     child = extend(options, model, effects)
-    found = RunFolder(options.root).read(IdentifyResult, child).effects
+    run = RunFolder(options.request.root)
+    found = run.read(IdentifyResult, child).effects
     if weak := [name for name in effects if not found[name].has_strength]:
         tell(f"{', '.join(weak)}: strength not significantly different from zero, removed")
         effects = tuple(effect for effect in effects if effect not in weak)
@@ -275,7 +261,7 @@ def _add(
         if not effects:
             return ""
         child = extend(options, model, effects)
-    ladder = {rung.model: rung for rung in RunFolder(options.root).read(CompareResult).ladder}
+    ladder = {rung.model: rung for rung in run.read(CompareResult).ladder}
     if ladder[child].improves_on(ladder[model]):
         return child
     why = "the held-out error does not fall"

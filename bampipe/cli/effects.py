@@ -4,15 +4,66 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from bampipe.cli import show
+from bampipe.cli.device import check_effect_file
+from bampipe.cli.options import RUNS, JsonOption, RunsOption
 from bampipe.errors import InputError, choose_from
 
 if TYPE_CHECKING:
     from bampipe.physics.effect import Effect
 
 COLUMNS, ROWS = 61, 13
+
+
+def effects(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="An effect, name[:target], or an effect file; or check, or adopt."),
+    ] = None,
+    file: Annotated[
+        str | None, typer.Argument(metavar="[FILE]", help="After check or adopt: the effect file.")
+    ] = None,
+    device: Annotated[
+        str, typer.Option(help="Device the effect is shown or checked on; a name or a file.")
+    ] = "bam",
+    runs: RunsOption = RUNS,
+    json: JsonOption = False,
+) -> None:
+    """List the effects a model can have; with a name, show one in full; check or adopt a file.
+
+    An adopted file is copied beside the run folders, and every run there weighs it from then on.
+
+    Example: bampipe effects
+
+    Example: bampipe effects stribeck:yaw
+
+    Example: bampipe effects check snag.toml --device rail.toml
+
+    Example: bampipe effects adopt runs/2026-10-03_s01/models/base/drafts/snag_by_position.toml
+    """
+    if name in ("check", "adopt") and file is None:
+        raise InputError("which effect file?", remedy=f"bampipe effects {name} FILE")
+    if name == "check":
+        check_effect_file(str(file), device, json)
+    elif name == "adopt":
+        from bampipe.api.loop import adopt_effect
+
+        copy = adopt_effect(Path(str(file)), runs)
+        if json:
+            show.print_json({"file": str(copy)})
+        else:
+            show.say(f"{copy}: every run in {runs} weighs it from its next diagnosis on")
+    elif file is not None:
+        raise InputError(f"{file!r} is one argument too many", remedy="bampipe effects NAME")
+    elif name is None:
+        list_all(json)
+    else:
+        show_one(name, device, json)
 
 
 def list_all(json: bool) -> None:

@@ -106,6 +106,7 @@ def extend(
     from bampipe.results.identify import IdentifyResult
     from bampipe.run import batch, models
     from bampipe.run import pipeline as pipelines
+    from bampipe.run.request import Request
 
     batch.limit_threads(1)
     effects = others or []
@@ -119,10 +120,10 @@ def extend(
     if not auto and not effects:
         raise InputError("no effect named", remedy="`bampipe effects` lists them; or use --auto")
     root = places.find_run(first, runs)
-    pipeline = pipelines.whole(root)
+    request = Request(root, pipelines.whole(root), force=force, wait=not no_wait)
     parent = models.choose_model(root, model)
     with show.Watcher(quiet or json) as watcher:
-        options = loop.LoopOptions(root, pipeline, force, not no_wait, watcher)
+        options = loop.LoopOptions(request, watcher)
         if auto:
             tell = (lambda line: None) if json else show.say
             last = loop.follow(options, parent, tell, draft)
@@ -153,9 +154,49 @@ def demo(runs: RunsOption = RUNS, force: ForceOption = False, quiet: QuietOption
 
     Example: bampipe demo
     """
-    from bampipe.cli.demo import demonstrate
-    from bampipe.run import batch
+    from dataclasses import replace
+
+    from bampipe.api.loop import LoopOptions, follow
+    from bampipe.results.compare import CompareResult
+    from bampipe.results.truth import TruthResult
+    from bampipe.results.validate import ValidateResult
+    from bampipe.run import batch, models, pipeline
+    from bampipe.run.request import Request
+    from bampipe.run.runner import run_session
+    from bampipe.run.session_name import session_id
 
     batch.limit_threads(1)
+    samples = pipeline.find_shipped("sample_runs")
+    if not samples.is_dir():
+        raise InputError("this installation has no sample sessions", where=str(samples))
+    session = samples / "demo"
+    root = runs / session_id(session)
+    request = Request(root, pipeline.load(), force=force)
+    complete = request.pipeline.with_every_stage()
+    run = RunFolder(root)
     with show.Watcher(quiet) as watcher:
-        demonstrate(runs, force, watcher, show.say)
+        show.say(f"1. {session}: an arm with a fault that its model lacks.")
+        run_session(replace(request, session=session, judge=True), watcher)
+        for axis, error in run.read(ValidateResult, models.BASE).axes.items():
+            show.say(
+                f"   {axis}: error on unseen trials {error.held_out_rmse:.3g} {error.unit}, "
+                f"sensor noise alone would leave {error.noise_floor:.3g} {error.unit}"
+            )
+        show.say(
+            "2. Which effect is missing? Diagnose and extend the model until nothing is missing."
+        )
+        options = LoopOptions(replace(request, pipeline=complete), watcher)
+        last = follow(options, models.BASE, lambda line: show.say(f"   {line}"))
+        show.say("3. The error on unseen trials, model by model.")
+        for rung in run.read(CompareResult).ladder:
+            errors = ", ".join(
+                f"{axis} {value:.3g} (floor {rung.noise_floor[axis]:.3g})"
+                for axis, value in sorted(rung.held_out_rmse.items())
+            )
+            show.say(f"   {rung.model}: {errors}")
+        options.run("report", "report", "")
+        hidden = TruthResult.read(samples / "demo.truth.json").configuration["effects"]
+        found = ", ".join(models.read(root, last).effects) or "nothing"
+        show.say(f"4. Found: {found}. What was hidden: {', '.join(hidden)}.")
+        show.say(f"   In print: {root}/report/report.pdf")
+        show.say(f"next: bampipe report {places.next_to(root, runs)} --open")

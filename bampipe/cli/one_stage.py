@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 from bampipe.cli import places, show
 from bampipe.cli.options import StageOptions
@@ -26,24 +25,14 @@ def stage_command(stage: str) -> Callable[[Callable[..., None]], Callable[..., N
 
     With ``--settings`` these are listed instead, whatever else is given.
     """
-    names = [field.name for field in fields(StageOptions)]
-    hints = get_type_hints(StageOptions, include_extras=True)
-    shared = [
-        inspect.Parameter(
-            field.name,
-            inspect.Parameter.POSITIONAL_OR_KEYWORD,
-            default=field.default,
-            annotation=hints[field.name],
-        )
-        for field in fields(StageOptions)
-    ]
+    shared = inspect.signature(StageOptions).parameters
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(command, eval_str=True).parameters.values())[:-1]
 
         @wraps(command)
         def expanded(**given: Any) -> None:
-            options = StageOptions(**{name: given.pop(name) for name in names})
+            options = StageOptions(**{name: given.pop(name) for name in shared})
             if options.list_settings:
                 module = base.load_stage(stage)
                 show.say(f"{stage}: {module.SUMMARY}\n")
@@ -53,8 +42,9 @@ def stage_command(stage: str) -> Callable[[Callable[..., None]], Callable[..., N
             else:
                 command(**given, options=options)
 
-        expanded.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]
-        expanded.__annotations__ = {item.name: item.annotation for item in (*own, *shared)}
+        whole = inspect.Signature([*own, *shared.values()])
+        expanded.__signature__ = whole  # type: ignore[attr-defined]
+        expanded.__annotations__ = {p.name: p.annotation for p in whole.parameters.values()}
         return expanded
 
     return decorate

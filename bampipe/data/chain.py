@@ -93,32 +93,26 @@ def read_chain(
         InputError: another file, a wrong joint or link, or no single chain between the links.
     """
     with located(str(path), ": "):
-        return _chain(read_tree(path), base, tip, payload)
-
-
-def _chain(tree: Tree, base: str, tip: str, payload: Mapping[str, Any] | None) -> Chain:
-    _refuse_broken(tree)
-    for link in filter(None, (base, tip)):
-        _require_link(tree, link, f"no link {link!r}")
-    base = base or _only_root(tree)
-    tip = tip or _only_end(tree, base)
-    tree, held_alone = _hold_followers(tree, tree.path(base, tip))
-    joints = tree.path(base, tip)
-    if payload is not None:
-        held = tree.bodies[tip].joined(Body.of_table(payload))
-        tree = replace(tree, bodies={**tree.bodies, tip: held})
-    moving = [joint for joint in joints if joint.kind != "fixed"]
-    if not moving:
-        raise InputError(f"no joint moves between {base!r} and {tip!r}")
-    lumped = LumpedBodies(tree, moving)
-    limits = {identifier(joint.name): joint.limits for joint in moving}
-    held_still = [*held_alone] + [
-        joint.name for start in moving for joint in lumped.held_on(start.child)
-    ]
-    notes = tree.notes
-    if held_still:
-        notes = (f"held at zero beside the chain: {join_names(held_still, _MANY)}", *notes)
-    return Chain(_tables(joints, lumped), limits, base, tip, notes, *gravity_at(tree, base))
+        tree = read_tree(path)
+        _refuse_broken(tree)
+        for link in filter(None, (base, tip)):
+            _require_link(tree, link, f"no link {link!r}")
+        base = base or _only_root(tree)
+        tip = tip or _only_end(tree, base)
+        tree, held_still = _hold_followers(tree, tree.path(base, tip))
+        joints = tree.path(base, tip)
+        if payload is not None:
+            held = tree.bodies[tip].joined(Body.of_table(payload))
+            tree = replace(tree, bodies={**tree.bodies, tip: held})
+        moving = [joint for joint in joints if joint.kind != "fixed"]
+        if not moving:
+            raise InputError(f"no joint moves between {base!r} and {tip!r}")
+        lumped, notes = LumpedBodies(tree, moving), tree.notes
+        limits = {identifier(joint.name): joint.limits for joint in moving}
+        held_still += [joint.name for start in moving for joint in lumped.held_on(start.child)]
+        if held_still:
+            notes = (f"held at zero beside the chain: {join_names(held_still, _MANY)}", *notes)
+        return Chain(_tables(joints, lumped), limits, base, tip, notes, *gravity_at(tree, base))
 
 
 def _hold_followers(tree: Tree, path: Sequence[TreeJoint]) -> tuple[Tree, list[str]]:

@@ -7,14 +7,14 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
 from bampipe.data.robot_tree import Body, DriveLimits, Tree, TreeJoint, fixed_joint, symmetric
-from bampipe.data.robot_xml import document, number, number_list, numbers
+from bampipe.data.robot_xml import Attribute, assign, document, number, numbers, put
 from bampipe.errors import InputError, did_you_mean, located
 from bampipe.lists import join_names
 
@@ -56,83 +56,68 @@ def mjcf_text(name: str, tree: Tree, gravity: Sequence[float], comment: str, add
     Parents come first in ``tree``; ``gravity`` is in the frame of its root, m/s2; ``comment`` is
     said at the head, and ``add`` is what else it has.
     """
-    root = ElementTree.Element("mujoco", model=name)
-    ElementTree.SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
-    ElementTree.SubElement(
-        root, "option", gravity=number_list(gravity), timestep=number_list([STEP_S]),
-        integrator="implicitfast",
-    )  # fmt: skip
-    world = ElementTree.SubElement(root, "worldbody")
-    actuators = ElementTree.SubElement(root, "actuator")
+    root = Element("mujoco", model=name)
+    put(root, "compiler", angle="radian", inertiafromgeom="false")
+    put(root, "option", gravity=gravity, timestep=STEP_S, integrator="implicitfast")
+    world, actuators = put(root, "worldbody"), put(root, "actuator")
     carried = {joint.child for joint in tree.joints}
     (stem,) = (link for link in tree.bodies if link not in carried)
     bodies = {stem: world}
     if stem != _WORLD:
-        bodies[stem] = ElementTree.SubElement(world, "body", name=stem)
+        bodies[stem] = put(world, "body", name=stem)
         _write_inertial(bodies[stem], tree.bodies[stem])
     for joint in tree.joints:
         x, y, z, w = Rotation.from_matrix(joint.turn).as_quat()
-        body = ElementTree.SubElement(
-            bodies[joint.parent], "body", name=joint.child,
-            pos=number_list(joint.offset), quat=number_list((w, x, y, z)),
-        )  # fmt: skip
+        frame: dict[str, Attribute] = {"pos": joint.offset, "quat": (w, x, y, z)}
+        body = put(bodies[joint.parent], "body", name=joint.child, **frame)
         bodies[joint.child] = body
         _write_inertial(body, tree.bodies[joint.child])
         if joint.kind != "fixed":
             _write_joint(body, actuators, joint, add)
     for load, kind, inertia in add.loads:
-        body = ElementTree.SubElement(world, "body", name=load)
+        body = put(world, "body", name=load)
         _write_inertial(body, Body(_TINY, np.zeros(3), _TINY * np.eye(3)))
-        ElementTree.SubElement(body, "joint", name=load, type=kind, armature=number_list([inertia]))
-    tendons = ElementTree.SubElement(root, "tendon") if add.tendons else root
+        put(body, "joint", name=load, type=kind, armature=inertia)
+    tendons = put(root, "tendon") if add.tendons else root
     for attributes, turns in add.tendons:
-        tendon = ElementTree.SubElement(tendons, "fixed", {**_FIRM, **attributes})
+        tendon = put(tendons, "fixed", **{**_FIRM, **attributes})
         for moved, turn in turns.items():
-            ElementTree.SubElement(tendon, "joint", joint=moved, coef=number_list([turn]))
+            put(tendon, "joint", joint=moved, coef=turn)
     for attributes in add.bristles:
-        ElementTree.SubElement(actuators, "dcmotor", attributes)
+        put(actuators, "dcmotor", **attributes)
     return document(root, comment)
 
 
-def _write_inertial(element: ElementTree.Element, body: Body) -> None:
+def _write_inertial(element: Element, body: Body) -> None:
     """Write the inertial element of a body, zeros too: not every parser of MJCF takes none."""
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.inertia
-    inertial = ElementTree.SubElement(
-        element, "inertial", pos=number_list(body.center), mass=number_list([body.mass])
-    )
+    inertial = put(element, "inertial", pos=body.center, mass=body.mass)
     if body.inertia.any():
-        inertial.set("fullinertia", number_list((xx, yy, zz, xy, xz, yz)))
+        assign(inertial, fullinertia=(xx, yy, zz, xy, xz, yz))
     else:
-        inertial.set("diaginertia", "0 0 0")
+        assign(inertial, diaginertia="0 0 0")
 
 
-def _write_joint(
-    body: ElementTree.Element, actuators: ElementTree.Element, joint: TreeJoint, add: Additions
-) -> None:
+def _write_joint(body: Element, actuators: Element, joint: TreeJoint, add: Additions) -> None:
     own = joint.limits
     kind = "prismatic" if joint.kind == "prismatic" else "revolute"
-    usual = {
-        "name": joint.name, "type": _KINDS[kind], "axis": number_list(joint.axis),
-        "damping": number_list([own.damping]), "frictionloss": number_list([own.friction]),
-        "armature": number_list([own.armature]),
+    usual: dict[str, Attribute] = {
+        "name": joint.name, "type": _KINDS[kind], "axis": joint.axis, "damping": own.damping,
+        "frictionloss": own.friction, "armature": own.armature,
     }  # fmt: skip
-    moves = ElementTree.SubElement(
-        body, "joint", {**usual, **_FIRM, **add.joints.get(joint.name, {})}
-    )
+    moves = put(body, "joint", **{**usual, **_FIRM, **add.joints.get(joint.name, {})})
     drive = {"name": f"drive_{joint.name}", "joint": joint.name, **add.drives.get(joint.name, {})}
-    motor = ElementTree.SubElement(actuators, "general" if len(drive) > 2 else "motor", drive)
+    motor = put(actuators, "general" if len(drive) > 2 else "motor", **drive)
     if own.lower < own.upper:
-        moves.set("limited", "true")
-        moves.set("range", number_list((own.lower, own.upper)))
+        assign(moves, limited="true", range=(own.lower, own.upper))
     if own.effort > 0.0:
-        motor.set("ctrllimited", "true")
-        motor.set("ctrlrange", number_list((-own.effort, own.effort)))
+        assign(motor, ctrllimited="true", ctrlrange=(-own.effort, own.effort))
 
 
 class _Reader:
     """Walks the bodies of an MJCF and collects links and joints."""
 
-    def __init__(self, root: ElementTree.Element) -> None:
+    def __init__(self, root: Element) -> None:
         compiler = _merged(root, "compiler")
         self.radian = compiler.get("angle", "degree") == "radian"
         self.sequence = compiler.get("eulerseq", "xyz")
@@ -155,14 +140,14 @@ class _Reader:
         self.bodies = {_WORLD: Body()}
         self.joints: list[TreeJoint] = []
 
-    def _read_defaults(self, entry: ElementTree.Element, outer: Mapping[str, str]) -> None:
+    def _read_defaults(self, entry: Element, outer: Mapping[str, str]) -> None:
         joint = entry.find("joint")
         own = {**outer, **({} if joint is None else joint.attrib)}
         self.defaults[entry.get("class", "")] = own
         for inner in entry.iterfind("default"):
             self._read_defaults(inner, own)
 
-    def _read_motor(self, motor: ElementTree.Element) -> None:
+    def _read_motor(self, motor: Element) -> None:
         """Note the effort of a joint that a motor alone is for."""
         joint = motor.get("joint")
         ranges = ("ctrlrange", "forcerange") if motor.tag == "motor" else ("forcerange",)
@@ -174,9 +159,7 @@ class _Reader:
             gear = numbers(motor, "gear", "1", max(len(motor.get("gear", "1").split()), 1))[0]
         self.efforts[joint] = max(abs(low), abs(high)) * abs(gear)
 
-    def walk(
-        self, body: ElementTree.Element, parent: str, shift: Array, given: str, moves: bool
-    ) -> None:
+    def walk(self, body: Element, parent: str, shift: Array, given: str, moves: bool) -> None:
         """Read a body and those on it.
 
         Args:
@@ -200,7 +183,7 @@ class _Reader:
                     raise InputError(f"no <default> of class {usual!r}{near}")
                 known = {**self.defaults[usual], **entry.attrib}
                 joint = known.get("name") or f"{name}_joint{k or ''}"
-                own = ElementTree.Element("joint", known)
+                own = Element("joint", known)
                 kind = "free" if entry.tag == "freejoint" else known.get("type", "hinge")
                 kind = _READ.get(kind, kind)
                 with located(f"joint {joint!r}", ": "):
@@ -229,7 +212,7 @@ class _Reader:
     def angle(self, value: float) -> float:
         return value if self.radian else math.radians(value)
 
-    def orientation(self, element: ElementTree.Element) -> Array:
+    def orientation(self, element: Element) -> Array:
         """Rotation of an element's frame, (3, 3)."""
         if element.get("quat"):
             w, x, y, z = numbers(element, "quat", "", 4)
@@ -260,7 +243,7 @@ class _Reader:
             return np.asarray(Rotation.align_vectors(up, (0.0, 0.0, 1.0))[0].as_matrix())
         return np.eye(3)
 
-    def body(self, body: ElementTree.Element, moves: bool) -> Body:
+    def body(self, body: Element, moves: bool) -> Body:
         """Its mass; refused where it moves and follows from shapes."""
         inertial = body.find("inertial")
         shapes = body.find("geom") is not None
@@ -275,7 +258,7 @@ class _Reader:
         inertia = np.diag(numbers(inertial, "diaginertia", "0 0 0", 3))
         return Body(mass, np.zeros(3), inertia).moved(self.orientation(inertial), center)
 
-    def limits(self, own: ElementTree.Element, joint: str, kind: str) -> DriveLimits:
+    def limits(self, own: Element, joint: str, kind: str) -> DriveLimits:
         low, high = numbers(own, "range", "0 0", 2)
         limited = own.get("limited", "auto")
         if limited == "false" or (limited == "auto" and not self.autolimits):
@@ -287,7 +270,7 @@ class _Reader:
         return DriveLimits(low, high, effort or self.efforts.get(joint, 0.0), 0.0, *losses)
 
 
-def mjcf_tree(root: ElementTree.Element) -> Tree:
+def mjcf_tree(root: Element) -> Tree:
     """The bodies and joints of an MJCF.
 
     A joint beside a body's origin moves the frame of the link to the joint.
@@ -304,9 +287,9 @@ def mjcf_tree(root: ElementTree.Element) -> Tree:
     return Tree(reader.bodies, reader.joints, notes, (x, y, z))
 
 
-def _merged(root: ElementTree.Element, tag: str) -> ElementTree.Element:
+def _merged(root: Element, tag: str) -> Element:
     """All elements of a tag as one, the later ones counting."""
-    merged = ElementTree.Element(tag)
+    merged = Element(tag)
     for element in root.iterfind(tag):
         merged.attrib.update(element.attrib)
     return merged

@@ -76,16 +76,13 @@ def read_recording(
         if all(name != part.name for name, _ in places.values()):
             continue
         time = (part.time or own_time) if part.join != "rows" else ""
-        unit = part.time_unit or clock.unit
         if part.join == "rows" and places.get(clock.column, ("", ""))[0] == part.name:
             time = places[clock.column][1]
-        other = read(part.name, part.file, time, unit)
-        kept = [column for column, (name, _) in places.items() if name == part.name]
+        other = read(part.name, part.file, time, part.time_unit or clock.unit)
         if part.join == "rows":
-            raw = _by_rows(raw, other, entry, part, kept)
+            raw = _by_rows(raw, other, entry, part)
         else:
-            ticks = SECONDS.get(clock.unit, 1.0), SECONDS.get(unit, 1.0)
-            raw = _by_time(raw, other, entry.file, part, kept, (clock.column, time), ticks)
+            raw = _by_time(raw, other, entry, part, clock, time)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
     return _at_one_rate(_without_codes(_filled(_one_of(raw, entry, clock), clock), clock), clock)
 
@@ -195,9 +192,7 @@ def _place(column: str, entry: TrialEntry) -> tuple[str, str]:
     return "", column
 
 
-def _by_rows(
-    raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part, kept: Sequence[str]
-) -> RawTrial:
+def _by_rows(raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part) -> RawTrial:
     """The columns side by side, sample by sample."""
     if not raw.columns:
         return other
@@ -213,36 +208,32 @@ def _by_rows(
     if most > least:
         longer = entry.file if counts[0] == most else part.file
         remark += f"; the last {most - least} of {longer} left out"
-    columns = {name: values[:least] for name, values in raw.columns.items()}
-    columns |= {name: other.columns[name][:least] for name in kept}
-    return _with_columns(raw, other, columns, remark)
+    columns = {**raw.columns, **other.columns}
+    shortened = {name: values[:least] for name, values in columns.items()}
+    return _with_columns(raw, other, shortened, remark)
 
 
 def _by_time(
-    raw: RawTrial,
-    other: RawTrial,
-    file: str,
-    part: Part,
-    kept: Sequence[str],
-    times: tuple[str, str],
-    ticks: tuple[float, float],
+    raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part, clock: Clock, time: str
 ) -> RawTrial:
-    """The columns of the part between its samples, at the times of the others."""
-    t, u = raw.columns[times[0]], other.columns[times[1]]
+    """The columns of the part between its samples, by its ``time``, at the times of the others."""
+    t, u = raw.columns[clock.column], other.columns[time]
     t_0, u_0 = (float(x[np.isfinite(x)][:1].sum()) for x in (t, u))
+    ticks = [SECONDS.get(unit, 1.0) for unit in (clock.unit, part.time_unit or clock.unit)]
     at, stamps = (t - t_0) * ticks[0], (u - u_0) * ticks[1]
     if part.join == "time":
-        moments = other.since.get(times[1], 0) - raw.since.get(times[0], 0)
+        moments = other.since.get(time, 0) - raw.since.get(clock.column, 0)
         stamps += u_0 * ticks[1] - t_0 * ticks[0] + moments / NANOSECONDS
     span = min(np.nanmax(at), np.nanmax(stamps)) - max(np.nanmin(at), np.nanmin(stamps))
     if not span > 0.0:
         raise InputError(
-            f"no time in common with {file}: it starts {np.nanmin(stamps):.4g} s after that",
+            f"no time in common with {entry.file}: it starts {np.nanmin(stamps):.4g} s after that",
             where=part.file,
             remedy='join = "start" where both clocks count from the same moment',
         )
-    found = {name: interpolated(at, stamps, other.columns[name]) for name in kept}
-    remark = f"{part.file} interpolated linearly at the times of {file}"
+    kept = {name: values for name, values in other.columns.items() if name != time}
+    found = {name: interpolated(at, stamps, values) for name, values in kept.items()}
+    remark = f"{part.file} interpolated linearly at the times of {entry.file}"
     remark += f" (at most {np.nanmax(np.diff(stamps)):.3g} s apart)"
     within = np.flatnonzero((at >= np.nanmin(stamps)) & (at <= np.nanmax(stamps)))
     joined = _with_columns(raw, other, {**raw.columns, **found}, remark)
@@ -282,30 +273,24 @@ def _one_of(raw: RawTrial, entry: TrialEntry, clock: Clock) -> RawTrial:
     return replace(part, remarks=(*raw.remarks, said))
 
 
-def find_copies(session: Session) -> list[str]:
-    """Why each trial is refused as the same file or content as another, or ''."""
-    same: dict[str, list[int]] = defaultdict(list)
-    for number, entry in enumerate(session.trials):
+def find_copies(session: Session) -> dict[str, str]:
+    """Why trials are refused as the same file or content as another, by their names."""
+    same: dict[str, list[TrialEntry]] = defaultdict(list)
+    for entry in session.trials:
         try:
             path = inside(session.root, entry.file, where="")
         except InputError:
             continue  # said when the trial's turn comes
         if path.stat().st_size > 0:
-            same[digest_file(path)].append(number)
-    reasons = [""] * len(session.trials)
-    for alike_files in same.values():
-        numbers = [
-            n
-            for n in alike_files
-            if any(session.trials[n].overlaps(session.trials[m]) for m in alike_files if m != n)
-        ]
-        entries = [session.trials[number] for number in numbers]
+            same[digest_file(path)].append(entry)
+    reasons: dict[str, str] = {}
+    for trials in same.values():
+        entries = [e for e in trials if any(e.overlaps(one) for one in trials if one is not e)]
         alike = len({(entry.kind, entry.locked_axis, entry.viscous) for entry in entries}) == 1
-        for number in numbers[1:] if alike else numbers if len(numbers) > 1 else []:
-            entry = session.trials[number]
+        for entry in entries[1:] if alike else entries:
             other = next(e for e in entries if e is not entry)
             what = "file" if other.file == entry.file else "content"
-            reasons[number] = f"the same {what} as trial {other.name}" + (
+            reasons[entry.name] = f"the same {what} as trial {other.name}" + (
                 ": used once" if alike else f", which is declared {other.kind}"
             )
     return reasons

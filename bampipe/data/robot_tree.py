@@ -123,7 +123,7 @@ class TreeJoint:
     offset: Array
     angles: tuple[float, float, float]
     axis: list[float]
-    limits: DriveLimits
+    limits: DriveLimits = DriveLimits()
     mimic: tuple[str, float, float] | None = None
 
 
@@ -234,22 +234,15 @@ def tree_of_tables(tables: Mapping[str, Mapping[str, Any]]) -> Tree:
         link, after = f"{name}_link", table.get("after")
         bodies[link] = Body.of_table(table)
         roll, pitch, yaw = (float(v) for v in table.get("rotation", (0.0,) * 3))
-        joints.append(
-            TreeJoint(
-                name,
-                str(table["kind"]),
-                f"{after}_link" if after else "base",
-                link,
-                Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix(),
-                np.array(table.get("position", (0.0,) * 3), dtype=float),
-                (roll, pitch, yaw),
-                [float(v) for v in table.get("axis", (0.0, 0.0, 1.0))],
-                DriveLimits(),
-                (str(table["follows"]), float(table.get("ratio", 1)), float(table.get("zero", 0)))
-                if table.get("follows")
-                else None,
-            )
-        )
+        turn = Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix()
+        offset = np.array(table.get("position", (0.0,) * 3), dtype=float)
+        axis = [float(v) for v in table.get("axis", (0.0, 0.0, 1.0))]
+        ends = f"{after}_link" if after else "base", link
+        joint = TreeJoint(name, str(table["kind"]), *ends, turn, offset, (roll, pitch, yaw), axis)
+        if other := table.get("follows"):
+            mimic = str(other), float(table.get("ratio", 1)), float(table.get("zero", 0))
+            joint = replace(joint, mimic=mimic)
+        joints.append(joint)
     return Tree(bodies, joints)
 
 
@@ -258,10 +251,8 @@ def fixed_joint(name: str, parent: str, child: str, turn: Array, offset: Array) 
     from scipy.spatial.transform import Rotation
 
     roll, pitch, yaw = (float(v) for v in Rotation.from_matrix(turn).as_euler("xyz"))
-    axis = [0.0, 0.0, 1.0]
-    return TreeJoint(
-        name, "fixed", parent, child, turn, offset, (roll, pitch, yaw), axis, DriveLimits()
-    )
+    frame = turn, offset, (roll, pitch, yaw)
+    return TreeJoint(name, "fixed", parent, child, *frame, [0.0, 0.0, 1.0])
 
 
 def identifier(name: str) -> str:
@@ -287,11 +278,15 @@ class LumpedBodies:
                 found.setdefault(joint.parent, []).append(joint)
         return found
 
-    def body_on(self, link: str) -> Body:
-        """The body of a link with all that is fixed to it or held still on it, in its frame."""
-        total = self.tree.bodies[link]
+    def body_on(self, link: str, held_only: bool = False) -> Body:
+        """The body of a link with all that is fixed to it or held still on it, in its frame.
+
+        ``held_only``: the part of it that is behind joints held still.
+        """
+        total = Body() if held_only else self.tree.bodies[link]
         for joint in self._behind.get(link, ()):
-            total = total.joined(self.body_on(joint.child).moved(joint.turn, joint.offset))
+            part = self.body_on(joint.child, held_only and joint.kind == "fixed")
+            total = total.joined(part.moved(joint.turn, joint.offset))
         return total
 
     def held_on(self, link: str) -> Iterator[TreeJoint]:
@@ -307,15 +302,6 @@ class LumpedBodies:
             if joint.kind == "fixed":
                 yield joint.child
                 yield from self.fixed_on(joint.child)
-
-    def body_held_on(self, link: str) -> Body:
-        """The part of `body_on` that is behind joints held still, in the frame of the link."""
-        total = Body()
-        for joint in self._behind.get(link, ()):
-            fixed = joint.kind == "fixed"
-            part = self.body_held_on(joint.child) if fixed else self.body_on(joint.child)
-            total = total.joined(part.moved(joint.turn, joint.offset))
-        return total
 
 
 def put_bodies(
@@ -335,7 +321,7 @@ def put_bodies(
     named = {joint.name: identifier(joint.name) for joint in moving}
     for joint in moving:
         own = bodies[named[joint.name]]
-        placed[joint.child] = own.without(lumped.body_held_on(joint.child))
+        placed[joint.child] = own.without(lumped.body_on(joint.child, held_only=True))
         placed |= {link: Body() for link in lumped.fixed_on(joint.child)}
     joints = [
         replace(joint, limits=limits[named[joint.name]]) if joint.name in named else joint

@@ -14,6 +14,8 @@ LARGEST_BYTES = 20_000_000
 _MEND = "mend it, or take it out of the folder"
 DEEPEST = 200
 """Most elements inside one another."""
+Attribute = str | float | Iterable[float]
+"""Of an element: text, a number or several."""
 
 
 def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
@@ -80,6 +82,19 @@ def document(root: ElementTree.Element, comment: str, indented: bool = True) -> 
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
 
 
-def number_list(values: Iterable[float]) -> str:
-    """Numbers as an attribute of XML holds them."""
-    return " ".join(repr(float(v)) for v in values)
+def number_list(values: float | Iterable[float]) -> str:
+    """A number or several as an attribute of XML holds them."""
+    several = values if isinstance(values, Iterable) else (values,)
+    return " ".join(repr(float(v)) for v in several)
+
+
+def assign(element: ElementTree.Element, **attributes: Attribute) -> ElementTree.Element:
+    """Give an element attributes; returns it."""
+    texts = {k: v if isinstance(v, str) else number_list(v) for k, v in attributes.items()}
+    element.attrib.update(texts)
+    return element
+
+
+def put(parent: ElementTree.Element, tag: str, **attributes: Attribute) -> ElementTree.Element:
+    """Add an inner element with attributes; returns it."""
+    return assign(ElementTree.SubElement(parent, tag), **attributes)

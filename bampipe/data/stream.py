@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +121,7 @@ class SampleStream:
     _delimiter: str = ","
     _width: int = 0
     _indices: tuple[int, ...] = ()
-    _last: float = field(default=-np.inf)
+    _last: float = -np.inf
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -153,49 +153,38 @@ class SampleStream:
             raise InputError(
                 "a line without end: this is no text table", where=f"{self.name}: {self._line + 1}"
             )
-        lines = text[:cut].decode("utf-8", errors="replace").splitlines()
-        if self._layout is None:
-            lines = self._header(lines)
-        if self._layout is None or not lines:
+        rows: dict[int, list[float]] = {}
+        for line in text[:cut].decode("utf-8", errors="replace").splitlines():
+            self._line += 1
+            plain = line if self._layout else line.lstrip("\ufeff")
+            if not plain.strip() or plain.startswith("#"):
+                continue
+            if self._layout is None:
+                self._take_header(plain)
+            elif row := self._row(plain.split(self._delimiter), self._layout):
+                rows[self._line] = row
+        if self._layout is None or not rows:
             return np.empty((0, len(self.names)))
-        return self._samples(lines, self._layout)
+        return self._samples(rows, self._layout)
 
-    def _header(self, lines: list[str]) -> list[str]:
-        """Take the header, after comments; return the lines below it."""
-        while lines and self._layout is None:
-            line = lines.pop(0).lstrip("\ufeff")
-            self._line += 1
-            if not line.strip() or line.startswith("#"):
-                continue
-            self._delimiter = max(DELIMITERS, key=line.count)
-            found = [cell.strip().strip("\"'") for cell in line.split(self._delimiter)]
-            fitting = [layout for layout in self.layouts if set(layout.columns) <= set(found)]
-            if not fitting:
-                wanted = self.layouts[0].columns
-                missing = next(name for name in wanted if name not in found)
-                raise InputError(
-                    f"no column {missing!r} in the header",
-                    where=f"{self.name}: line {self._line}",
-                    remedy=f"the columns must be {', '.join(wanted)}",
-                )
-            self._layout, self._width, self._last_good = fitting[0], len(found), self._line
-            self._indices = tuple(found.index(name) for name in fitting[0].columns)
-        return lines
+    def _take_header(self, line: str) -> None:
+        self._delimiter = max(DELIMITERS, key=line.count)
+        found = [cell.strip().strip("\"'") for cell in line.split(self._delimiter)]
+        fitting = [layout for layout in self.layouts if set(layout.columns) <= set(found)]
+        if not fitting:
+            wanted = self.layouts[0].columns
+            missing = next(name for name in wanted if name not in found)
+            raise InputError(
+                f"no column {missing!r} in the header",
+                where=f"{self.name}: line {self._line}",
+                remedy=f"the columns must be {', '.join(wanted)}",
+            )
+        self._layout, self._width, self._last_good = fitting[0], len(found), self._line
+        self._indices = tuple(found.index(name) for name in fitting[0].columns)
 
-    def _samples(self, lines: list[str], layout: StreamLayout) -> Array:
-        rows: list[list[float]] = []
-        numbers: list[int] = []
-        for line in lines:
-            self._line += 1
-            if not line.strip() or line.startswith("#"):
-                continue
-            row = self._row(line.split(self._delimiter), layout)
-            if row is not None:
-                rows.append(row)
-                numbers.append(self._line)
-        if not rows:
-            return np.empty((0, len(layout.names)))
-        raw = np.array(rows)
+    def _samples(self, rows: Mapping[int, list[float]], layout: StreamLayout) -> Array:
+        """The samples of rows of numbers, by number of the line."""
+        raw, numbers = np.array([*rows.values()]), [*rows]
         lost = np.isnan(raw) & layout.may_lack
         numeric = np.isfinite(raw) | lost
         with np.errstate(over="ignore", invalid="ignore"):
@@ -225,11 +214,11 @@ class SampleStream:
             self._last_good = numbers[int(np.flatnonzero(keep)[-1])]
         return np.asarray(values[keep])
 
-    def _row(self, cells: list[str], layout: StreamLayout) -> list[float] | None:
-        """The numbers of a line; None where it is bad, which is said."""
+    def _row(self, cells: list[str], layout: StreamLayout) -> list[float]:
+        """The numbers of a line; none where it is bad, which is said."""
         if len(cells) != self._width:
             self._skip(self._line, "", f"{len(cells)} cells where the header has {self._width}")
-            return None
+            return []
         row = []
         for index, column, may_lack in zip(
             self._indices, layout.columns, layout.may_lack, strict=True
@@ -242,7 +231,7 @@ class SampleStream:
                 row.append(np.nan if may_lack and not text else float(text))
             except ValueError:
                 self._skip(self._line, column, f"{text[:40]!r} is no number")
-                return None
+                return []
         return row
 
     def _skip(self, number: int, column: str, what: str) -> None:

@@ -493,9 +493,7 @@ class _Logs:
             f"{trial.file} holds {len(starts)} recordings, which begin again at row {rows}"
             + (", ..." if len(starts) > 4 else "")
         )
-        return [
-            TrialEntry(file=trial.file, kind="free", recording=n) for n, _ in enumerate(starts, 1)
-        ]
+        return [trial.model_copy(update={"recording": n}) for n, _ in enumerate(starts, 1)]
 
 
 def _like(path: Path) -> str:

@@ -1,22 +1,23 @@
 """URDF files: what their links and joints say, and a robot written as one."""
 
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
 from bampipe.data.robot_tree import Body, DriveLimits, Tree, TreeJoint, symmetric
-from bampipe.data.robot_xml import document, number, number_list, numbers, read_xml
+from bampipe.data.robot_xml import Attribute, assign, document, number, numbers, put, read_xml
 from bampipe.errors import InputError, located
 
 _XACRO = ("{http://www.ros.org/wiki/xacro", "{http://ros.org/wiki/xacro", "{http://ros.org/xacro")
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _UNLIMITED = 1e6
 """Effort and velocity of a joint of which none is known: a URDF has some, and 0 is a limit."""
 
 
-def urdf_tree(root: ElementTree.Element, path: Path) -> Tree:
+def urdf_tree(root: Element, path: Path) -> Tree:
     """The links and joints of a URDF.
 
     Raises:
@@ -50,32 +51,30 @@ def unexpanded(path: Path) -> InputError:
     )
 
 
-def _name(element: ElementTree.Element) -> str:
+def _name(element: Element) -> str:
     name = element.get("name", "")
     if not name:
         raise InputError(f"a <{element.tag}> without a name")
     return name
 
 
-def _pose(element: ElementTree.Element | None) -> tuple[Array, Array, list[float]]:
+def _pose(element: Element | None) -> tuple[Array, Array, list[float]]:
     angles = numbers(element, "rpy", "0 0 0", 3)
     offset = np.array(numbers(element, "xyz", "0 0 0", 3))
     return Rotation.from_euler("xyz", angles).as_matrix(), offset, angles
 
 
-def _body(link: ElementTree.Element) -> Body:
+def _body(link: Element) -> Body:
     inertial = link.find("inertial")
     if inertial is None:
         return Body()
     turn, offset, _ = _pose(inertial.find("origin"))
     mass = number(inertial.find("mass"), "value")
-    entry = inertial.find("inertia")
-    keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    moments = [number(entry, key) for key in keys]
+    moments = [number(inertial.find("inertia"), key) for key in _MOMENTS]
     return Body(mass, np.zeros(3), symmetric(moments)).moved(turn, offset)
 
 
-def _joint(entry: ElementTree.Element) -> TreeJoint:
+def _joint(entry: Element) -> TreeJoint:
     ends = []
     for tag in ("parent", "child"):
         element = entry.find(tag)
@@ -102,31 +101,25 @@ def _joint(entry: ElementTree.Element) -> TreeJoint:
 
 def urdf_text(name: str, tree: Tree, comment: str) -> str:
     """A URDF of links and joints, without shapes; ``comment`` is said at its head."""
-    robot = ElementTree.Element("robot", name=name)
+    robot = Element("robot", name=name)
     for link, body in tree.bodies.items():
-        _put_inertial(ElementTree.SubElement(robot, "link", name=link), body)
+        _put_inertial(put(robot, "link", name=link), body)
     for joint in tree.joints:
         own = joint.limits
         moves, bounded = joint.kind != "fixed", own.lower < own.upper
         kind = "continuous" if joint.kind == "revolute" and not bounded else joint.kind
-        entry = ElementTree.SubElement(robot, "joint", name=joint.name, type=kind)
-        ElementTree.SubElement(
-            entry, "origin", xyz=number_list(joint.offset), rpy=number_list(joint.angles)
-        )
-        ElementTree.SubElement(entry, "parent", link=joint.parent)
-        ElementTree.SubElement(entry, "child", link=joint.child)
+        entry = put(robot, "joint", name=joint.name, type=kind)
+        put(entry, "origin", xyz=joint.offset, rpy=joint.angles)
+        put(entry, "parent", link=joint.parent)
+        put(entry, "child", link=joint.child)
         if moves:
-            ElementTree.SubElement(entry, "axis", xyz=number_list(joint.axis))
-            ElementTree.SubElement(
-                entry, "limit", lower=repr(own.lower), upper=repr(own.upper),
-                effort=repr(own.effort or _UNLIMITED), velocity=repr(own.velocity or _UNLIMITED),
-            )  # fmt: skip
-            _put_losses(entry, own)
+            put(entry, "axis", xyz=joint.axis)
+            most = {"effort": own.effort or _UNLIMITED, "velocity": own.velocity or _UNLIMITED}
+            put(entry, "limit", lower=own.lower, upper=own.upper, **most)
+            _enter(entry, "dynamics", damping=own.damping, friction=own.friction)
             if joint.mimic is not None:
                 other, ratio, zero = joint.mimic
-                ElementTree.SubElement(
-                    entry, "mimic", joint=other, multiplier=repr(ratio), offset=repr(zero)
-                )
+                put(entry, "mimic", joint=other, multiplier=ratio, offset=zero)
     return document(robot, comment)
 
 
@@ -142,12 +135,12 @@ def changed_urdf(path: Path, before: Tree, after: Tree, comment: str) -> str:
         if after.bodies[name] is not before.bodies[name]:
             _put_inertial(link, after.bodies[name])
     for entry, old, new in zip(robot.iterfind("joint"), before.joints, after.joints, strict=True):
-        if new.limits is not old.limits:
-            _put_losses(entry, new.limits)
+        if (own := new.limits) is not old.limits:
+            _enter(entry, "dynamics", damping=own.damping, friction=own.friction)
     return document(robot, comment, indented=False)
 
 
-def _put_inertial(link: ElementTree.Element, body: Body) -> None:
+def _put_inertial(link: Element, body: Body) -> None:
     """Give a link the mass of a body, and none where that has none."""
     inertial = link.find("inertial")
     if body.mass == 0.0 and not body.inertia.any():
@@ -155,24 +148,15 @@ def _put_inertial(link: ElementTree.Element, body: Body) -> None:
             link.remove(inertial)
         return
     if inertial is None:
-        inertial = ElementTree.SubElement(link, "inertial")
+        inertial = put(link, "inertial")
         inertial.tail = "\n"
-    origin = {"xyz": number_list(body.center), "rpy": "0 0 0"}
-    keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    moments = zip(keys, body.inertia[np.triu_indices(3)], strict=True)
-    inertia = {key: repr(float(value)) for key, value in moments}
-    mass = {"value": repr(float(body.mass))}
-    for tag, numbers_of in (("origin", origin), ("mass", mass), ("inertia", inertia)):
-        _entry(inertial, tag).attrib.update(numbers_of)
+    _enter(inertial, "origin", xyz=body.center, rpy="0 0 0")
+    _enter(inertial, "mass", value=body.mass)
+    moments = zip(_MOMENTS, body.inertia[np.triu_indices(3)], strict=True)
+    _enter(inertial, "inertia", **dict(moments))
 
 
-def _put_losses(entry: ElementTree.Element, limits: DriveLimits) -> None:
-    """Give a joint damping and friction."""
-    dynamics = {"damping": repr(limits.damping), "friction": repr(limits.friction)}
-    _entry(entry, "dynamics").attrib.update(dynamics)
-
-
-def _entry(element: ElementTree.Element, tag: str) -> ElementTree.Element:
-    """The inner element of a tag; a new one where there is none."""
+def _enter(element: Element, tag: str, **attributes: Attribute) -> None:
+    """Give the inner element of a tag attributes; a new one where there is none."""
     found = element.find(tag)
-    return ElementTree.SubElement(element, tag) if found is None else found
+    assign(put(element, tag) if found is None else found, **attributes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -93,11 +93,8 @@ class Moved(Record):
     sentence: str
 
 
-class CompareResult(Result):
+class CompareResult(Result, file="compare.json", stage="compare"):
     """The ladder of model versions on the same held-out trials."""
-
-    FILE: ClassVar[str] = "compare.json"
-    STAGE: ClassVar[str] = "compare"
 
     best: str = Field(
         description="The model used by default: the confirmed one with the lowest held-out error"

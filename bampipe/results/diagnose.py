@@ -1,6 +1,6 @@
 """``models/<model>/diagnose.json``: effects that the model lacks, by axis, with probabilities."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -125,11 +125,8 @@ class WorstWindow(Record):
     doing: str = Field(description="Motion of the device")
 
 
-class DiagnoseResult(Result):
+class DiagnoseResult(Result, file="models/{model}/diagnose.json", stage="diagnose"):
     """Effects that the model lacks, by axis, with probabilities."""
-
-    FILE: ClassVar[str] = "models/{model}/diagnose.json"
-    STAGE: ClassVar[str] = "diagnose"
 
     model: str
     trials: Names = Field(default=(), description="Trials on which effects were weighed")

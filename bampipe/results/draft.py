@@ -1,6 +1,6 @@
 """``models/<model>/draft.json``: a formula for a residual that no effect explains."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -91,11 +91,8 @@ class AxisDraft(Record):
     sentence: str
 
 
-class DraftResult(Result):
+class DraftResult(Result, file="models/{model}/draft.json", stage="draft"):
     """Formulas for residuals that no effect of the library explains, by axis."""
-
-    FILE: ClassVar[str] = "models/{model}/draft.json"
-    STAGE: ClassVar[str] = "draft"
 
     model: str
     sentence: str = Field(description="The findings in words")

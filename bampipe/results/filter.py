@@ -1,6 +1,6 @@
 """``filter/filter.json``: how the motion was differentiated, and how well."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -50,11 +50,8 @@ class Disturbance(Record):
     reason: str
 
 
-class FilterResult(Result):
+class FilterResult(Result, file="filter/filter.json", stage="filter"):
     """How the motion was differentiated, and how well."""
-
-    FILE: ClassVar[str] = "filter/filter.json"
-    STAGE: ClassVar[str] = "filter"
 
     headline: str
     method: str

@@ -1,6 +1,6 @@
 """``models/<model>/identify.json``: parameters of a model with uncertainties."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -266,11 +266,8 @@ class BaseEstimate(Record):
     shown: bool = Field(description="Whether the trials determine it better than the drawing does")
 
 
-class IdentifyResult(Result):
+class IdentifyResult(Result, file="models/{model}/identify.json", stage="identify"):
     """Parameters of a model with uncertainties."""
-
-    FILE: ClassVar[str] = "models/{model}/identify.json"
-    STAGE: ClassVar[str] = "identify"
 
     model: str
     headline: str

@@ -1,6 +1,6 @@
 """``ingest/session.json``: channels and sensors of the session, in SI units."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -82,11 +82,8 @@ class DeadStretch(Record):
     missing: bool = Field(default=False, description="Whether it has no readings there")
 
 
-class IngestResult(Result):
+class IngestResult(Result, file="ingest/session.json", stage="ingest"):
     """Channels and sensors of the session, in SI units."""
-
-    FILE: ClassVar[str] = "ingest/session.json"
-    STAGE: ClassVar[str] = "ingest"
 
     session_id: str = Field(min_length=1)
     device: str = Field(min_length=1)

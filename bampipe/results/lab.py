@@ -1,6 +1,6 @@
 """``lab/lab.json`` and ``lab/trends.json``: a lab's sessions, and control charts over them."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -8,11 +8,8 @@ from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
 
-class LabResult(Result):
+class LabResult(Result, file="lab.json", stage="lab"):
     """The sessions and tables of a lab's data set."""
-
-    FILE: ClassVar[str] = "lab.json"
-    STAGE: ClassVar[str] = "lab"
 
     schema_: Literal["bampipe.lab/1"] = Field(alias="schema")
     sessions: Names = Field(description="In the order of their recording")
@@ -85,11 +82,8 @@ class SessionVerdict(Record):
     remedy: str
 
 
-class TrendsResult(Result):
+class TrendsResult(Result, file="trends.json", stage="lab"):
     """Control charts of a lab's parameters, and a verdict on each session."""
-
-    FILE: ClassVar[str] = "trends.json"
-    STAGE: ClassVar[str] = "lab"
 
     schema_: Literal["bampipe.trends/1"] = Field(alias="schema")
     fewest_sessions: int = Field(ge=1, description="Fewest sessions for control limits")

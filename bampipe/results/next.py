@@ -159,11 +159,9 @@ class Plan(Record):
     confusion: tuple[PlannedConfusion, ...] = ()
 
 
-class NextResult(Result):
+class NextResult(Result, file="models/{model}/next.json", stage="next"):
     """The trial to record next, and its expected result."""
 
-    FILE: ClassVar[str] = "models/{model}/next.json"
-    STAGE: ClassVar[str] = "next"
     EARLIER: ClassVar[str] = "models/{model}/forecasts"
     """Folder of earlier proposals whose trial may still come, each as in FILE."""
 

@@ -1,7 +1,5 @@
 """``models/<model>/performance.json``: the device at its handle, and its constants."""
 
-from typing import ClassVar
-
 from pydantic import Field
 
 from bampipe.results.record import Names, Record, Result, Size
@@ -51,11 +49,8 @@ class Handle(Record):
     inertia: Range
 
 
-class PerformanceResult(Result):
+class PerformanceResult(Result, file="models/{model}/performance.json", stage="performance"):
     """Stiffness, friction and inertia at the handle, and the numbers of the device file."""
-
-    FILE: ClassVar[str] = "models/{model}/performance.json"
-    STAGE: ClassVar[str] = "performance"
 
     model: str
     headline: str

@@ -66,6 +66,10 @@ class Result(Record):
     FILE: ClassVar[str]
     STAGE: ClassVar[str]
 
+    def __init_subclass__(cls, file: str, stage: str, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.FILE, cls.STAGE = file, stage
+
     @classmethod
     def file(cls, model: str = "") -> str:
         """Return the path of the result of ``model``, relative to the folder."""

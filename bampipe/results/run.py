@@ -1,6 +1,6 @@
 """``run.json``: steps, settings, inputs and outputs of a run."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -105,11 +105,8 @@ class GateVerdict(Record):
     message: str
 
 
-class RunResult(Result):
+class RunResult(Result, file="run.json", stage="run"):
     """Provenance: steps, settings, inputs and outputs of a run."""
-
-    FILE: ClassVar[str] = "run.json"
-    STAGE: ClassVar[str] = "run"
 
     schema_: Literal["bampipe.run/1"] = Field(alias="schema")
     run: str = Field(default="", description="Name of the run folder")

@@ -1,6 +1,6 @@
 """``filter/setup.json``: whether the recorded signals mean what session and device file say."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -52,11 +52,8 @@ class AxisSetup(Record):
     moving_share: Share = Field(description="Share of the samples in which the axis moves")
 
 
-class SetupResult(Result):
+class SetupResult(Result, file="filter/setup.json", stage="filter"):
     """Whether the recorded signals mean what session and device file say."""
-
-    FILE: ClassVar[str] = "filter/setup.json"
-    STAGE: ClassVar[str] = "filter"
 
     headline: str = Field(description="Empty if nothing is wrong")
     mistakes: tuple[SetupMistake, ...]

@@ -1,6 +1,6 @@
 """``stiffness/stiffness.json``: stiffness of the axes that were locked and loaded."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -99,11 +99,8 @@ class GearStiffness(Record):
     channel: str = Field(description="Of the second encoder")
 
 
-class StiffnessResult(Result):
+class StiffnessResult(Result, file="stiffness/stiffness.json", stage="stiffness"):
     """Stiffness of the axes that were locked and loaded, and of gears with two encoders."""
-
-    FILE: ClassVar[str] = "stiffness/stiffness.json"
-    STAGE: ClassVar[str] = "stiffness"
 
     headline: str
     notes: Names = Field(description="Trials without loops, slipping brakes, small loads")

@@ -1,7 +1,5 @@
 """``models/<model>/terms.json``: the equations of a model and the force of each term."""
 
-from typing import ClassVar
-
 from pydantic import Field
 
 from bampipe.results.record import Names, Record, Result, Share
@@ -40,11 +38,8 @@ class ModelTerm(Record):
     curves: tuple[TermCurve, ...]
 
 
-class TermsResult(Result):
+class TermsResult(Result, file="models/{model}/terms.json", stage="validate"):
     """The equations of a model, and the force of each of its terms."""
-
-    FILE: ClassVar[str] = "models/{model}/terms.json"
-    STAGE: ClassVar[str] = "validate"
 
     model: str
     equations: Names = Field(

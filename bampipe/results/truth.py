@@ -1,17 +1,14 @@
 """``<session>.truth.json``: the truth about a session made by `bampipe simulate`."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
 from bampipe.results.record import Result
 
 
-class TruthResult(Result):
+class TruthResult(Result, file="{session}.truth.json", stage="simulate"):
     """The hidden effects and parameters of a simulated session."""
-
-    FILE: ClassVar[str] = "{session}.truth.json"
-    STAGE: ClassVar[str] = "simulate"
 
     schema_: Literal["bampipe.truth/1"] = Field(alias="schema")
     device: str

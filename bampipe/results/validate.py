@@ -1,6 +1,6 @@
 """``models/<model>/validate.json``: predicted against measured torque and force."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
@@ -107,11 +107,8 @@ class FreeRun(Record):
     )
 
 
-class ValidateResult(Result):
+class ValidateResult(Result, file="models/{model}/validate.json", stage="validate"):
     """Predicted against measured torque and force."""
-
-    FILE: ClassVar[str] = "models/{model}/validate.json"
-    STAGE: ClassVar[str] = "validate"
 
     model: str
     headline: str

@@ -1,6 +1,6 @@
 """``models/<model>/viscous.json``: damping at the handle in the viscous trials."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -25,11 +25,8 @@ class Damping(Record):
     verdict: str | None = None
 
 
-class ViscousResult(Result):
+class ViscousResult(Result, file="models/{model}/viscous.json", stage="viscous"):
     """Damping at the handle in the viscous trials."""
-
-    FILE: ClassVar[str] = "models/{model}/viscous.json"
-    STAGE: ClassVar[str] = "viscous"
 
     model: str
     headline: str

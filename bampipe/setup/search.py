@@ -39,7 +39,6 @@ ALIKE = 1.5
 """Largest difference of scores at which two mistakes cannot be distinguished."""
 MOST_MISTAKES = 4
 
-Judge = Callable[[tuple[Correction, ...]], Plausibility | None]
 SUSPICIOUS_PRIORS = 5.0
 """Sum of objections above which other set-ups are tried: two parameters beyond two deviations."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
@@ -65,6 +64,7 @@ _HALVINGS = 11
 
 Family = Callable[[float], Correction]
 Corrections = tuple[Correction, ...]
+Trials = tuple[Sequence[Motion], Folds]
 
 
 @dataclass(frozen=True)
@@ -83,63 +83,9 @@ class Finding:
     gain: float
 
 
-def confirm_mistakes(
-    judge: Judge,
-    chosen: tuple[Correction, ...],
-    others: Sequence[Correction],
-    placeholders: Sequence[str] = (),
-) -> tuple[Finding, ...]:
-    """Return the mistakes among corrections ``chosen`` together, the largest gain first.
-
-    Corrections without which the error hardly rises are dropped. There are no mistakes if some axis
-    remains unexplained, or is worse than as stated.
-
-    Args:
-        others: corrections that may replace a chosen one.
-        placeholders: signals whose scale is exactly 1.
-    """
-    found: list[Finding] = []
-    while chosen:
-        after = judge(chosen)
-        if after is None:
-            return ()
-        found = []
-        for one in chosen:
-            before = judge(drop_correction(chosen, one)) or after.with_nothing_explained()
-            found.append(Finding(one, (), before, after, gain_of(before, after, one.cost)))
-        idle = min(found, key=lambda f: f.gain - least_gain(f.correction, placeholders))
-        if idle.gain >= least_gain(idle.correction, placeholders):
-            break
-        chosen = drop_correction(chosen, idle.correction)
-    stated = judge(())
-    spoilt = stated is not None and chosen and spoils_sound_axes(stated, found[0].after)
-    if spoilt or not 0 < len(chosen) <= MOST_MISTAKES:
-        return ()
-    most = score_of(judge, chosen) + ALIKE
-    for place, finding in enumerate(found):
-        rest = drop_correction(chosen, finding.correction)
-        known = {(one.kind, one.signals) for one in chosen}
-        rivals: dict[tuple[str, tuple[str, ...]], Correction] = {}
-        for other in others:
-            key = (other.kind, other.signals)
-            if key not in known and score_of(judge, (*rest, other)) < most:
-                rivals.setdefault(key, other)
-        found[place] = replace(finding, rivals=tuple(rivals.values()))
-    found.sort(key=lambda finding: -finding.gain)
-    explained = all((f.after.left[spoilt_axes(f)] < EXPLAINED).all() for f in found)
-    return tuple(found) if explained else ()
-
-
-def drop_correction(corrections: tuple[Correction, ...], one: Correction) -> tuple[Correction, ...]:
+def drop_correction(corrections: Corrections, one: Correction) -> Corrections:
     """Return all corrections but ``one``."""
     return tuple(other for other in corrections if other is not one)
-
-
-def score_of(judge: Judge, corrections: tuple[Correction, ...]) -> float:
-    """Score of a set-up, lower being better; infinite if it cannot be computed."""
-    found = judge(corrections)
-    cost = sum(one.cost for one in corrections)
-    return math.inf if found is None else found.score(RANKED_ERROR) + cost
 
 
 def least_gain(correction: Correction, placeholders: Sequence[str] = ()) -> float:
@@ -219,14 +165,63 @@ class Search:
                 break
             tried += singles
             chosen = (*chosen, *self._with_refined_factor(chosen, best))
-        return confirm_mistakes(self.judge, chosen, self.rivals(tried), placeholders)
+        return self.confirm(chosen, self.rivals(tried), placeholders)
+
+    def confirm(
+        self, chosen: Corrections, others: Sequence[Correction], placeholders: Sequence[str] = ()
+    ) -> tuple[Finding, ...]:
+        """Return the mistakes among corrections ``chosen`` together, the largest gain first.
+
+        Corrections without which the error hardly rises are dropped. There are no mistakes if some
+        axis remains unexplained, or is worse than as stated.
+
+        Args:
+            others: corrections that may replace a chosen one.
+            placeholders: signals whose scale is exactly 1.
+        """
+        found: list[Finding] = []
+        while chosen:
+            after = self.judge(chosen)
+            if after is None:
+                return ()
+            found = []
+            for one in chosen:
+                before = self.judge(drop_correction(chosen, one)) or after.with_nothing_explained()
+                found.append(Finding(one, (), before, after, gain_of(before, after, one.cost)))
+            idle = min(found, key=lambda f: f.gain - least_gain(f.correction, placeholders))
+            if idle.gain >= least_gain(idle.correction, placeholders):
+                break
+            chosen = drop_correction(chosen, idle.correction)
+        stated = self.judge(())
+        spoilt = stated is not None and chosen and spoils_sound_axes(stated, found[0].after)
+        if spoilt or not 0 < len(chosen) <= MOST_MISTAKES:
+            return ()
+        most = self.score(chosen) + ALIKE
+        for place, finding in enumerate(found):
+            rest = drop_correction(chosen, finding.correction)
+            known = {(one.kind, one.signals) for one in chosen}
+            rivals: dict[tuple[str, tuple[str, ...]], Correction] = {}
+            for other in others:
+                key = (other.kind, other.signals)
+                if key not in known and self.score((*rest, other)) < most:
+                    rivals.setdefault(key, other)
+            found[place] = replace(finding, rivals=tuple(rivals.values()))
+        found.sort(key=lambda finding: -finding.gain)
+        explained = all((f.after.left[spoilt_axes(f)] < EXPLAINED).all() for f in found)
+        return tuple(found) if explained else ()
+
+    def score(self, corrections: Corrections) -> float:
+        """Score of a set-up, lower being better; infinite if it cannot be computed."""
+        found = self.judge(corrections)
+        cost = sum(one.cost for one in corrections)
+        return math.inf if found is None else found.score(RANKED_ERROR) + cost
 
     def _best(
         self, chosen: Corrections, options: Sequence[Corrections], placeholders: Sequence[str]
     ) -> Corrections:
         """Return the best of the options that gain enough and spoil no axis."""
         before = self.judge(chosen)
-        ranked = sorted(options, key=lambda option: score_of(self.judge, (*chosen, *option)))
+        ranked = sorted(options, key=lambda option: self.score((*chosen, *option)))
         for option in filter(None, ranked):
             after = self.judge((*chosen, *option))
             if after is None:
@@ -248,7 +243,7 @@ class Search:
         refined = self._refine(chosen, family, start, math.inf, float(DECADES[1] - DECADES[0]))
         found = (refined, *rest)
         far = abs(math.log(refined.factor / first.factor)) > _SAME_FACTOR
-        gain = score_of(self.judge, (*chosen, *best)) - score_of(self.judge, (*chosen, *found))
+        gain = self.score((*chosen, *best)) - self.score((*chosen, *found))
         return found if far and gain > ALIKE else best
 
     def _continuous(self, chosen: Corrections) -> list[Correction]:
@@ -288,7 +283,7 @@ class Search:
         return len(self.signals.axes) <= MOST_AXES
 
     @cached_property
-    def screened(self) -> tuple[Sequence[Motion], Folds]:
+    def screened(self) -> Trials:
         """The part of the trials for all set-ups: two fitted trials and a braked one."""
         folds = self.folds
         fitted = [k for k, fits in enumerate(folds.fitted) if fits]
@@ -302,19 +297,14 @@ class Search:
         """Return the plausibility of a set-up on the trials; None if it cannot be computed."""
         key = tuple(id(one) for one in corrections)
         if key not in self._judged:
-            found = self._judge(corrections, self.motions, self.folds, 12)
+            found = self._judge(corrections, (self.motions, self.folds), 12)
             self._judged[key] = found, corrections
         return self._judged[key][0]
 
     def _judge(
-        self,
-        corrections: Corrections,
-        motions: Sequence[Motion],
-        folds: Folds,
-        steps: int,
-        posed: Sequence[int] = (),
+        self, corrections: Corrections, trials: Trials, steps: int, posed: Sequence[int] = ()
     ) -> Plausibility | None:
-        change = hypotheses.combine(self.signals, corrections)
+        (motions, folds), change = trials, hypotheses.combine(self.signals, corrections)
         with np.errstate(all="ignore"):
             changed = [change.of_motion(motion, self.signals) for motion in motions]
         return judge_setup(self.system, changed, change.of_band(self.band), folds, steps, posed)
@@ -324,7 +314,7 @@ class Search:
         if not _is_gross(correction, self.motions, self.signals):
             return math.inf
         self.tested += 1
-        found = self._judge((*chosen, correction), *self.screened, _SCREENING_STEPS)
+        found = self._judge((*chosen, correction), self.screened, _SCREENING_STEPS)
         return math.inf if found is None else found.score(RANKED_ERROR) + correction.cost
 
     def lacks_pose(self, best: Corrections) -> bool:
@@ -334,7 +324,7 @@ class Search:
         """
         axes = axes_without_pose(self.system, self.motions) if self.has_few_axes else []
         stated = self.judge(())
-        found = self._judge((), self.motions, self.folds, 12, axes) if axes else None
+        found = self._judge((), (self.motions, self.folds), 12, axes) if axes else None
         if found is None or stated is None:
             return False
         after = self.judge(best) if best else None

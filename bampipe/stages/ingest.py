@@ -123,8 +123,8 @@ def _ingest_trials(
     for number, entry in enumerate(session.trials):
         progress(number / total, entry.name)
         try:
-            if copies[number]:
-                raise InputError(copies[number], where=entry.file)
+            if entry.name in copies:
+                raise InputError(copies[entry.name], where=entry.file)
             trial = read_sound_trial(session, entry, config, config.largest_trial_mb << 20)
         except InputError as error:
             rows.append(_row(entry, None, str(error)))

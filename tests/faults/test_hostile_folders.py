@@ -260,7 +260,7 @@ def test_trials_that_are_no_tables_are_one_line(toy: Toy, command: Command, tria
 
 def test_an_effect_whose_name_is_a_path_writes_nothing(toy: Toy, outside: Path) -> None:
     """A diagnosis in a run folder names effects: `extend --auto` takes them from there."""
-    options = loop.LoopOptions(toy.root, toy.request().pipeline, False, False, ignore_event)
+    options = loop.LoopOptions(toy.request(session=None, judge=False, wait=False), ignore_event)
     before = everything(toy.folder)
     for name in ("../../../outside/x", "a/b:yaw", "x:../../y", "\0", ".."):
         with pytest.raises(InputError):

@@ -124,7 +124,7 @@ def test_a_damaged_record_is_named_by_verify_and_rebuilt(toy: Toy) -> None:
 def test_extending_respects_the_lock(toy: Toy) -> None:
     toy.run()
     events: list[Event] = []
-    options = loop.LoopOptions(toy.root, toy.request().pipeline, False, False, events.append)
+    options = loop.LoopOptions(toy.request(session=None, judge=False, wait=False), events.append)
     before = toy.files()
     with (
         record.lock(toy.root, False),

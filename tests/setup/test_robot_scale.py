@@ -13,7 +13,7 @@ from bampipe.physics.registry import device_from
 from bampipe.setup.hypotheses import scale_correction
 from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch
-from bampipe.setup.search import Finding, confirm_mistakes, shorten
+from bampipe.setup.search import Finding, shorten
 from bampipe.setup.turned_trials import find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -134,7 +134,8 @@ def test_what_spoils_a_joint_that_was_right_is_no_mistake(third: float, named: b
         for error, objection in (((0.10, 0.55, 0.08, 0.21), 1.0), ((0.12, 0.32, third, 0.21), 0.5))
     )
     twice = scale_correction(search.signals, FORCES, 2.0, 0.0)
-    assert bool(confirm_mistakes(lambda chosen: after if chosen else before, (twice,), ())) == named
+    search.judge = lambda chosen: after if chosen else before
+    assert bool(search.confirm((twice,), ())) == named
 
 
 def test_a_drive_that_one_trial_has_turned_is_named_with_it() -> None:

@@ -26,20 +26,21 @@ TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 SHEETS = (".xlsx", ".xlsm")
 """Of workbooks, whose first sheet with rows is read as a text."""
 _AGAIN = "copy it again from the logger"
-_FORMATS: tuple[tuple[tuple[str, ...], ModuleType, str, str], ...] = (
+Reader = ModuleType | arrays.ArrayReader
+_FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     (TEXTS, text, "", ""),
     (SHEETS, text, "workbook of Excel", "save it again, or export the sheet as CSV"),
     ((".parquet",), parquet, "Parquet file", _AGAIN),
-    ((".mat",), mat, "MATLAB file", "save it again from MATLAB"),
-    ((".h5", ".hdf5", ".hdf"), hdf5, "HDF5 file", _AGAIN),
-    ((".json", ".jsonl", ".ndjson"), objects, "", ""),
-    ((".tdms",), tdms, "TDMS file", _AGAIN),
+    ((".mat",), mat.READER, "MATLAB file", "save it again from MATLAB"),
+    ((".h5", ".hdf5", ".hdf"), hdf5.READER, "HDF5 file", _AGAIN),
+    ((".json", ".jsonl", ".ndjson"), objects.READER, "", ""),
+    ((".tdms",), tdms.READER, "TDMS file", _AGAIN),
     ((".bag", ".db3"), bag, "bag", f"{_AGAIN}, with the message definitions in it"),
     ((".mcap",), bag, "MCAP file", f"{_AGAIN}, with the message definitions in it"),
-    ((".npy", ".npz"), arrays, "file of NumPy", "save it again with np.savez"),
+    ((".npy", ".npz"), arrays.READER, "file of NumPy", "save it again with np.savez"),
 )
 """File extensions and their reader; of what libraries read, what to do where they cannot."""
-_READERS = {extension: module for own, module, _, _ in _FORMATS for extension in own}
+_READERS = {extension: reader for own, reader, _, _ in _FORMATS for extension in own}
 _FOREIGN = {extension: (kind, remedy) for own, _, kind, remedy in _FORMATS for extension in own}
 EXTENSIONS = tuple(_READERS)
 """File extensions that can be read."""
@@ -123,7 +124,7 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
     return {column: stated or named.get(column, "") for column, stated in columns.items()}
 
 
-def _units_in_names(reader: ModuleType, names: Iterable[str]) -> dict[str, str]:
+def _units_in_names(reader: Reader, names: Iterable[str]) -> dict[str, str]:
     """Units parsed from column names; the reader of text tables parses those of its header itself.
 
     Brackets may also hold an index or a joint name; in a bag they always do.
@@ -170,7 +171,7 @@ def _safely(path: Path) -> Iterator[None]:
             resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def _reader(path: Path) -> ModuleType:
+def _reader(path: Path) -> Reader:
     """The reader of a file by its extension, with which its first bytes must agree.
 
     InputError where it cannot be read, is empty, unsupported, or of another kind.

@@ -8,7 +8,8 @@ array are columns, too. Pickled objects, which may run any program, are not read
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate
@@ -55,6 +56,7 @@ _VALUES = ("values", "value", "data")
 """Fields that hold the name of a signal, and its samples."""
 Arrays = Mapping[str, Stored]
 """What a file holds, by name."""
+Opened = tuple[Arrays, tuple[str, ...]]
 
 
 def stored(array: np.ndarray | None, unit: str = "", kind: str = "") -> Stored:
@@ -242,6 +244,30 @@ def _end_to_end(parts: Iterable[Stored]) -> np.ndarray:
     return np.concatenate([part.load().ravel() for part in parts])
 
 
+@dataclass(frozen=True)
+class ArrayReader:
+    """A reader of a format whose files hold arrays by name.
+
+    Attributes:
+        what: an array of such a file is called in messages.
+        opened: what a file holds, while it is open, and what was left out, a sentence each; for
+            what is wanted of it, or to list it.
+    """
+
+    what: str
+    opened: Callable[[Path, Wanted | None], AbstractContextManager[Opened]]
+
+    def read(self, path: Path, wanted: Wanted) -> RawTrial:
+        """The wanted columns; `InputError` as `read_arrays`, or where the file is damaged."""
+        with self.opened(path, wanted) as (arrays, notes):
+            return replace(read_arrays(arrays, wanted, self.what), notes=notes)
+
+    def columns(self, path: Path) -> dict[str, str]:
+        """Names and units of the columns that were recorded together; see `columns_of_arrays`."""
+        with self.opened(path, None) as (arrays, _):
+            return columns_of_arrays(arrays)
+
+
 def _refuse_blocks(arrays: Arrays) -> None:
     """Refuse a file whose arrays all have three dimensions or more."""
     blocks = [(name, array.shape) for name, array in arrays.items() if len(array.shape) > 2]
@@ -253,23 +279,9 @@ def _refuse_blocks(arrays: Arrays) -> None:
         )
 
 
-def read(path: Path, wanted: Wanted) -> RawTrial:
-    """The wanted arrays; ``data[0]`` is the first column of the one array of a ``.npy``.
-
-    Raises:
-        InputError: damaged, pickled, an array missing, or not a vector of numbers.
-    """
-    return read_arrays(_arrays(path), wanted, "array")
-
-
-def columns(path: Path) -> dict[str, str]:
-    """Names of the vectors of numbers that were recorded together, or of columns; no units."""
-    arrays = _arrays(path)
-    _refuse_blocks(arrays)
-    return columns_of_arrays(arrays)
-
-
-def _arrays(path: Path) -> dict[str, Stored]:
+@contextmanager
+def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
+    """The arrays of a file; the one of a ``.npy`` is called ``data``."""
     try:
         loaded = np.load(path, allow_pickle=False)
         whole = {"data": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
@@ -283,4 +295,9 @@ def _arrays(path: Path) -> dict[str, Stored]:
         fields = array.dtype.names
         parts = {f"{key}.{part}": array[part] for part in fields} if fields else {key: array}
         found |= {label: stored(np.atleast_1d(part)) for label, part in parts.items()}
-    return found
+    if wanted is None:
+        _refuse_blocks(found)
+    yield found, ()
+
+
+READER = ArrayReader("array", _opened)

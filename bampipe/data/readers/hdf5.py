@@ -5,6 +5,7 @@ or a column of a matrix (``log/pose[2]``). What lies outside the file is not fol
 """
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,8 @@ from typing import Any
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import (
-    LINK,
-    Stored,
-    columns_of_arrays,
-    pick,
-    read_arrays,
-    split_index,
-    stored,
-)
-from bampipe.data.readers.trial import RawTrial, Wanted
+from bampipe.data.readers.arrays import LINK, ArrayReader, Opened, Stored, pick, split_index, stored
+from bampipe.data.readers.trial import Wanted
 from bampipe.errors import InputError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -31,31 +24,23 @@ _COLUMNS = ("columns", "channels", "names", "column_names", "labels", "fields")
 """Attributes with the names of the columns of a matrix."""
 
 
-def read(path: Path, wanted: Wanted, what: str = "dataset") -> RawTrial:
-    """The wanted columns of an HDF5 file, whose parts are called ``what`` in messages.
-
-    Raises:
-        InputError: damaged, a column missing, not a vector, or not of numbers.
-    """
+@contextmanager
+def opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
+    """What an HDF5 file holds."""
     import h5py  # heavy: only for these files
 
     with h5py.File(path, "r") as file:
-        known = dict(_arrays(file))
-        for column in wanted.columns:  # a field of a struct of MATLAB is a path here
-            own, _ = split_index(column, known)
+        known = dict(_arrays(file, alone=wanted is None))
+        for column in wanted.columns if wanted else ():
+            own, _ = split_index(column, known)  # a field of a struct of MATLAB is a path here
             known |= {own: known[at]} if (at := own.replace(".", "/")) in known else {}
-        return read_arrays(known, wanted, what)
+        yield known, ()
 
 
-def columns(path: Path) -> dict[str, str]:
-    """Names and units of the vectors of numbers that were recorded together."""
-    import h5py  # heavy: only for these files
-
-    with h5py.File(path, "r") as file:
-        return columns_of_arrays(dict(_arrays(file, alone=True)))
+READER = ArrayReader("dataset", opened)
 
 
-def _arrays(file: Any, alone: bool = False) -> Iterator[tuple[str, Stored]]:
+def _arrays(file: Any, alone: bool) -> Iterator[tuple[str, Stored]]:
     """What a file holds by name: datasets, fields of compound ones, columns of a matrix with names.
 
     Such a matrix itself, too, unless its columns are wanted ``alone``.

@@ -5,19 +5,14 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.readers import hdf5
-from bampipe.data.readers.arrays import (
-    Stored,
-    called_signals,
-    columns_of_arrays,
-    read_arrays,
-    stored,
-)
-from bampipe.data.readers.trial import RawTrial, Wanted
+from bampipe.data.readers.arrays import ArrayReader, Opened, Stored, called_signals, stored
+from bampipe.data.readers.trial import Wanted
 from bampipe.errors import InputError
 
 _HEADER = 128
@@ -30,28 +25,25 @@ _DEEPEST = 8
 _MOST_FIELDS = 4096
 
 
-def read(path: Path, wanted: Wanted) -> RawTrial:
-    """The wanted variables; ``X[0]`` is the first column of ``X``, ``S.q`` a field of ``S``.
-
-    Raises:
-        InputError: of another version, damaged, a variable missing, or not a vector of numbers.
-    """
-    for column in wanted.datetimes:
+@contextmanager
+def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
+    """The variables of a file; ``S.q`` is a field of ``S``. InputError of another version."""
+    for column in wanted.datetimes if wanted else ():
         raise InputError(
             "dates and times of MATLAB are not read",
             where=f"variable '{column}'",
             remedy="save seconds: t = seconds(stamp - stamp(1))",
         )
-    if not _is_level_5(path):
-        return hdf5.read(path, wanted, "variable")
-    arrays, root = _arrays(path)
-    whole = {f"{root}{label}": array for label, array in arrays.items()}
-    return read_arrays(whole | arrays, wanted, "variable")
+    if _is_level_5(path):
+        arrays, root = _arrays(path)
+        whole = {f"{root}{label}": array for label, array in arrays.items()} if wanted else {}
+        yield whole | arrays, ()
+    else:
+        with hdf5.opened(path, wanted) as known:
+            yield known
 
 
-def columns(path: Path) -> dict[str, str]:
-    """Names and units of the vectors of numbers that were recorded together, or of columns."""
-    return columns_of_arrays(_arrays(path)[0]) if _is_level_5(path) else hdf5.columns(path)
+READER = ArrayReader("variable", _opened)
 
 
 def _is_level_5(path: Path) -> bool:

@@ -7,7 +7,7 @@ as many names stands beside them, they have these.
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from contextlib import contextmanager
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -15,34 +15,19 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import (
-    Stored,
-    called_signals,
-    columns_of_arrays,
-    read_arrays,
-    stored,
-)
+from bampipe.data.readers.arrays import ArrayReader, Opened, Stored, called_signals, stored
 from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
-from bampipe.data.readers.trial import RawTrial, Wanted
+from bampipe.data.readers.trial import Wanted
 from bampipe.data.units import units_beside
 from bampipe.errors import InputError
 
 
-def read(path: Path, wanted: Wanted) -> RawTrial:
-    """The wanted columns: a list of objects, a list under one key, or one object a line (.jsonl).
-
-    Numbers beside that list are the same at every sample: a column for each of them.
-
-    Raises:
-        InputError: not JSON, no such list, a column missing or not of numbers.
-    """
-    arrays, notes = _contents(path, wanted.columns)
-    return replace(read_arrays(arrays, wanted, "value"), notes=notes)
+@contextmanager
+def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
+    yield _contents(path, wanted.columns if wanted else ())
 
 
-def columns(path: Path) -> dict[str, str]:
-    """Names of the values that are numbers, or moments (unit "datetime"), in the first sample."""
-    return columns_of_arrays(_contents(path)[0])
+READER = ArrayReader("value", _opened)
 
 
 def stated_units(path: Path) -> dict[str, str]:
@@ -96,8 +81,15 @@ def _with_lists(content: object, depth: int = 2) -> object:
     return {key: _with_lists(item, depth - 1) for key, item in content.items()}
 
 
-def _contents(path: Path, wanted: Sequence[str] = ()) -> tuple[dict[str, Stored], tuple[str, ...]]:
-    """What a file holds by name, what is ``wanted`` by other names too, and what was left out."""
+def _contents(path: Path, wanted: Sequence[str]) -> Opened:
+    """What a file holds by name, what is ``wanted`` by other names too, and what was left out.
+
+    It holds a list of objects, a list under one key, or one object a line (.jsonl). Numbers beside
+    that list are the same at every sample: a column for each of them.
+
+    Raises:
+        InputError: not JSON, or no such list.
+    """
     data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")

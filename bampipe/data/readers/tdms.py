@@ -13,32 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays
-from bampipe.data.readers.trial import RawTrial, Wanted, need
+from bampipe.data.readers.arrays import ArrayReader, Opened, Stored
+from bampipe.data.readers.trial import Wanted, need
 
 TIME = "@time"
 
 
-def read(path: Path, wanted: Wanted) -> RawTrial:
-    """The wanted channels of a TDMS file, scaled as the file says.
-
-    Raises:
-        InputError: npTDMS is not installed, the file is damaged, a channel is missing, not of
-            numbers, or not as long as the others.
-    """
-    with _arrays(path) as known:
-        return read_arrays(known, wanted, "channel")
-
-
-def columns(path: Path) -> dict[str, str]:
-    """Names and units of the channels of numbers, moments (unit "datetime") and waveform times."""
-    with _arrays(path) as known:
-        return columns_of_arrays(known)
-
-
 @contextmanager
-def _arrays(path: Path) -> Iterator[dict[str, Stored]]:
-    """The channels of a file, by npTDMS, which would print pages about a damaged one."""
+def _opened(path: Path, _: Wanted | None) -> Iterator[Opened]:
+    """The channels of a file, scaled as it says, by npTDMS, which would print pages on damage."""
     library = need("nptdms", "tdms")
     need("nptdms.log", "tdms").log_manager.set_level(logging.CRITICAL)
     found: dict[str, Stored] = {}
@@ -51,9 +34,12 @@ def _arrays(path: Path) -> Iterator[dict[str, Stored]]:
             step = channel.properties.get("wf_increment", 0.0)
             if isinstance(step, int | float) and step > 0.0:
                 found[label + TIME] = Stored(shape, "f", channel.time_track, "s")
-        yield found
+        yield found, ()
 
 
 def _read(channel: Any) -> np.ndarray:
     data = np.asarray(channel[:])
     return data.astype(object) if data.dtype.kind == "U" else data
+
+
+READER = ArrayReader("channel", _opened)
