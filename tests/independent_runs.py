@@ -87,8 +87,3 @@ def record_trials(
 def diagnose(run: bampipe.Run) -> dict[str, Any]:
     """Diagnose the newest model of ``run`` with few replicates, in this process."""
     return bampipe.diagnose(run, replicates=4, jobs=1)
-
-
-def error_over_floor(axis: dict[str, Any]) -> float:
-    """Held-out error of an axis with what was found, over its noise floor."""
-    return float(axis["rmse_after"] / axis["noise_floor"])

@@ -22,7 +22,6 @@ from binary_logs import write_mcap
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from /proc")
 
 ROWS = 20_000
-DATE = "2026-10-03T10:12:00"
 
 
 def packed_zeros(pack: Any, size: int) -> bytes:

@@ -35,18 +35,16 @@ def test_the_arm_is_identified_on_bad_days(tmp_path, day):
         assert estimates[name] == pytest.approx(value, rel=0.03), name
 
 
-@pytest.mark.parametrize(("machine", "seed"), [("joint", 18), ("axis", 19)])
-def test_machines_that_lack_nothing_are_identified(tmp_path, machine, seed):
-    run, truth = record_run(tmp_path, machine, seed)
-    off = deviations(run, truth)
-    assert max(map(abs, off.values())) < 4.0, off
-    axes = run.validation("base")
-    assert (axes.held_out_rmse < 1.25 * axes.noise_floor).all()
+SHAKEN = {"trials": 3, "seconds": 4.0, "rate_hz": 100.0}
+"""At up to 60 Hz: trials that no filter can follow at this rate are left out."""
 
 
-def test_a_damper_that_outruns_its_rate_in_some_trials_is_identified_from_the_others(tmp_path):
-    """Shaken at up to 60 Hz and logged at 100: what no filter can follow is left out."""
-    run, truth = record_run(tmp_path, "damper", 9401, trials=3, seconds=4.0, rate_hz=100.0)
+@pytest.mark.parametrize(
+    ("machine", "seed", "conditions"),
+    [("joint", 18, {}), ("axis", 19, {}), ("damper", 9401, SHAKEN)],
+)
+def test_machines_that_lack_nothing_are_identified(tmp_path, machine, seed, conditions):
+    run, truth = record_run(tmp_path, machine, seed, **conditions)
     off = deviations(run, truth)
     assert max(map(abs, off.values())) < 4.0, off
     axes = run.validation("base")
