@@ -23,7 +23,7 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
-from bampipe.results.floor import compare_with_floor
+from bampipe.results.floor import FLOOR_SDS
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.kept import KeptItems
@@ -386,9 +386,12 @@ class Fit:
 
     @property
     def is_above_floor(self) -> Flags:
-        """Whether the error of each axis is above the noise floor, (n_q,)."""
-        errors = zip(self.held_out_rmse, self.noise_floor.level, self.noise_floor.sd, strict=True)
-        return np.array([compare_with_floor(*map(float, e)) == "above_floor" for e in errors])
+        """Whether the error of each axis exceeds the noise floor by more than its scatter, (n_q,).
+
+        Below, an unknown function follows errors of the bias or hum, not the machine.
+        """
+        floor = self.noise_floor
+        return np.asarray(self.held_out_rmse > floor.level + FLOOR_SDS * floor.sd)
 
     @property
     def creeping_floor(self) -> Array:

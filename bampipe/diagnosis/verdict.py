@@ -82,9 +82,8 @@ def _judge(
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]
-    # At the floor, an unknown function follows errors of the bias or hum, not the machine.
-    above = against_floor == "above_floor"
-    unknown = min(float(selection.probabilities.unknown[axis]), 1.0) if above else 0.0
+    raw = min(float(selection.probabilities.unknown[axis]), 1.0)
+    unknown = raw if final.is_above_floor[axis] else 0.0
     remains = unknown >= c.probability
     verdict: Verdict
     if against_floor == "floor_missing":
