@@ -302,13 +302,11 @@ def gains_when_fitted(
     volume = search.volume_where_fitted(keys, after.evidence)
     if volume is None:
         return -np.inf, -np.inf
-    seen, held_out = (
-        _log_squares(before, b) - _log_squares(before, a)
-        for b, a in (
-            (before.rows_beyond_bias, after.rows_beyond_bias),
-            (before.held_out_rows(), after.held_out_rows()),
-        )
-    )
+    with_set, without = [
+        [_log_squares(before, rows) for rows in (fit.rows_beyond_bias, fit.held_out_rows())]
+        for fit in (after, before)
+    ]
+    seen, held_out = np.subtract(without, with_set)
     independent = before.problem.independent
     gain = float(independent @ seen + volume.sum()) - search.solve(keys).penalty
     return gain, float(np.sum(held_out + volume / np.maximum(independent, 1e-300)))

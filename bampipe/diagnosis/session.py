@@ -390,8 +390,8 @@ class Fit:
 
         Below, an unknown function follows errors of the bias or hum, not the machine.
         """
-        floor = self.noise_floor
-        return np.asarray(self.held_out_rmse > floor.level + FLOOR_SDS * floor.sd)
+        level, sd = self.noise_floor.level, self.noise_floor.sd
+        return np.asarray(self.held_out_rmse > level + FLOOR_SDS * sd)
 
     @property
     def creeping_floor(self) -> Array:
@@ -435,21 +435,21 @@ class Fit:
         """Return `rows_beyond_bias` on trials that no unknown has seen, without some effects."""
         rows = [np.zeros_like(y) for y in self.problem.y]
         for parts, unknowns in self._solve_held_out(effects):
-            left = self.problem.residual_rows(unknowns)
-            for row, part, here, root in zip(rows, parts, left, self.likelihood.root, strict=True):
-                row[part] = here[part] / root[part]
-        return rows
+            for row, part, left in zip(
+                rows, parts, self.problem.residual_rows(unknowns), strict=True
+            ):
+                row[part] = left[part]
+        return [row / root for row, root in zip(rows, self.likelihood.root, strict=True)]
 
     def _solve_held_out(self, effects: Iterable[str]) -> Iterator[tuple[list[Flags], Array]]:
         """Yield the samples of each group of trials, by axis, and the unknowns without them."""
-        p, absent = self.problem, self.problem.removal(effects)
+        p, absent, weight = self.problem, self.problem.removal(effects), self.solution.weight
         groups, group_of = np.unique(self.evidence.folds.groups, return_inverse=True)
         parts = [group_of[here.trial] for here in self.likelihood.samples]
         sums, is_unseen = p.sums(), len(groups) > 1
         for k, own in enumerate(zip(*p.sums_of(parts, len(groups)), strict=True)):
             xx, xy, yy = (whole - is_unseen * part for whole, part in zip(sums, own, strict=True))
-            yy = np.maximum(yy, 1e-300)
-            others = solve_bounded(p, xx, xy, yy, absent=absent, weight=self.solution.weight)
+            others = solve_bounded(p, xx, xy, np.maximum(yy, 1e-300), absent=absent, weight=weight)
             yield [part == k for part in parts], others.base
 
 

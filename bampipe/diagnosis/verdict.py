@@ -82,8 +82,7 @@ def _judge(
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]
-    raw = min(float(selection.probabilities.unknown[axis]), 1.0)
-    unknown = raw if final.is_above_floor[axis] else 0.0
+    unknown = float(final.is_above_floor[axis] * min(selection.probabilities.unknown[axis], 1.0))
     remains = unknown >= c.probability
     verdict: Verdict
     if against_floor == "floor_missing":
