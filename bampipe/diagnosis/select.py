@@ -269,11 +269,10 @@ def _leave_out(
 
 def _find_misleading(fit: Fit, probabilities: Probabilities, own: Sequence[str]) -> set[str]:
     """Return the effects that are less probable than not and raise the held-out error."""
-    out, least = set[str](), _log_squares(fit, fit.held_out_rows()).sum()
+    rows = fit.held_out_rows
+    out, least = set[str](), _log_squares(fit, rows()).sum()
     while doubtful := [e for e in own if e not in out and probabilities.effects.get(e, 0.0) < 0.5]:
-        left, worst = min(
-            (_log_squares(fit, fit.held_out_rows({*out, e})).sum(), e) for e in doubtful
-        )
+        left, worst = min((_log_squares(fit, rows({*out, e})).sum(), e) for e in doubtful)
         if left >= least:
             break
         out, least = {*out, worst}, left
