@@ -17,6 +17,9 @@ _SLOWEST_HZ = 100.0
 """A sensor's own low-pass correlates the noise of neighbouring samples, which still acts at the
 frequencies of the motion. A record thinned to this rate shows that noise."""
 _NORMAL_MEDIAN = 0.6744897501960817
+_CLIP, _CLIPPED_POWER, _CLIPPINGS = 2.0, 0.920536925636323, 8
+"""Standard deviations at which differences are clipped, where outliers raise their mean square no
+more than their median; the mean square of a normal variable clipped so; and iterations."""
 _CUT = 2.0
 """Multiple of the 90 % quantile of the magnitudes at which larger differences are clipped: 3.3
 standard deviations of a normal distribution."""
@@ -36,8 +39,8 @@ def white_noise_sd(
 ) -> float:
     """Standard deviation of the white noise in a record (T,) of a signal that is otherwise smooth.
 
-    It comes from the median absolute difference, which is robust against spikes and steps. It is
-    NaN for records that are too short.
+    It comes from clipped differences (Huber 1981, Robust Statistics, section 5.2), robust against
+    spikes and steps. It is NaN for records that are too short.
 
     Args:
         record: samples.
@@ -127,11 +130,19 @@ def _difference_noise(record: Array, t: Array | None, pulsed: bool = False) -> f
         if order < _LOWEST_ORDER:
             continue
         size = np.abs(differences) / np.sqrt(np.sum(weights**2, axis=0))
-        typical = _cut_rms(size) if pulsed else float(np.median(size)) / _NORMAL_MEDIAN
+        typical = _cut_rms(size) if pulsed else _clipped_sd(size)
         if typical == 0.0:  # more than half the differences are zero: coarse steps
             typical = float(np.sqrt(np.mean(np.square(size))))
         found.append(typical)
     return float(min(found))
+
+
+def _clipped_sd(size: Array) -> float:
+    """Return the standard deviation of normal noise by its magnitudes (n,), a few of them wild."""
+    sd = float(np.median(size)) / _NORMAL_MEDIAN
+    for _ in range(_CLIPPINGS):
+        sd = float(np.sqrt(np.mean(np.minimum(size, _CLIP * sd) ** 2) / _CLIPPED_POWER))
+    return sd
 
 
 def _cut_rms(size: Array) -> float:

@@ -26,6 +26,8 @@ _FOLLOWS = 0.8
 fraction is a controller's command. Handles, load cells, motor currents and a measured arm keep 0.98
 or more of their white noise; a command by gains on counts and their differences 0.003, or 0.5 to
 0.76 if the log keeps every second to tenth sample of the controller."""
+_ALIKE = 1.15
+"""Largest ratio between two measurements of the same noise in trials of a thousand samples."""
 DISAGREEMENT = 2.0
 """Ratio of stated to measured noise, or its inverse, beyond which a warning is given."""
 
@@ -160,8 +162,8 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
     pulses = [r.white_sd for r in records if r.pulsed]
     if 2 * len(pulses) > len(records):
         return float(np.sqrt(np.mean(np.square(pulses))))
-    white = _lower_quartile([record.white_sd for record in records])
-    slow = _lower_quartile([record.slow_sd for record in records])
+    white = _least_typical([record.white_sd for record in records])
+    slow = _least_typical([record.slow_sd for record in records])
     if white is None or slow is None or slow <= _COLOURED * white:
         return white
     if stated and stated**2 < white * slow:
@@ -169,9 +171,13 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
     return slow
 
 
-def _lower_quartile(values: Sequence[float]) -> float | None:
-    finite = [value for value in values if np.isfinite(value)]
-    return float(np.quantile(finite, 0.25)) if finite else None
+def _least_typical(values: Sequence[float]) -> float | None:
+    """Root mean square of what does not exceed the lower quartile by more than chance would."""
+    finite = np.array([value for value in values if np.isfinite(value)])
+    if not finite.size:
+        return None
+    alike = finite[finite <= _ALIKE * np.quantile(finite, 0.25)]
+    return float(np.sqrt(np.mean(alike**2)))
 
 
 @dataclass(frozen=True)

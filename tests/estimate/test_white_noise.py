@@ -44,6 +44,15 @@ def test_a_fast_signal_or_a_smoothing_sensor_is_told_from_noise():
     assert settle_force("force", "N", record.white_sd, [record]).noise_sd == record.white_sd
 
 
+def test_the_noise_of_short_trials_is_not_underestimated():
+    rng, t = np.random.default_rng(5), np.arange(900) / 90.0
+    found = [
+        settle_force("force", "N", None, [RecordNoise.of(rng.normal(size=900), t) for _ in "four"])
+        for _ in range(25)
+    ]
+    assert np.mean([noise.noise_sd for noise in found]) == pytest.approx(1.0, abs=0.015)
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.4, 0.8, 2.0])
 def test_noise_of_a_record_in_counts(noise):
     """In steps, and their rounding counts; a median of whole counts alone is off by up to 30 %."""
