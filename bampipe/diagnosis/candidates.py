@@ -33,6 +33,12 @@ class Candidate:
     searched_indices: tuple[int, ...]
 
     @property
+    def takes_timing(self) -> bool:
+        """Whether the effect delays every measured force."""
+        delayed = any(q.name in self.system.delays for q in self.parameters)
+        return delayed and self.system.takes_timing
+
+    @property
     def replaces_motion(self) -> bool:
         """Whether the effect changes the motion that the model sees, and nothing else."""
         return self.system.model.effects[-1].effect.kind == "measurement"

@@ -12,11 +12,9 @@ from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import compute_columns, make_parameters
 from bampipe.diagnosis.ranges import MachineScale, SearchRange
-from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
-from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.samples import Samples, take_samples
-from bampipe.trials.scale import NO_SLOPE, Spectra, find_spectra, gain_of_filter, slopes_by_force
+from bampipe.trials.scale import NO_SLOPE, Spectra, gain_of_filter, slopes_by_force
 
 _ALONE, _SEVERAL = 7, 5
 """Grid values per shape, for an effect with one shape and with several."""
@@ -132,14 +130,6 @@ class Dictionary:
         slopes = self._slopes(item, [make_parameters(e, item, values, b) for b in one_each])
         return Atom(found, slopes, self._gain(item, make_parameters(e, item, values), slopes))
 
-    def gain_with(self, name: str, parameters: Mapping[str, float]) -> Array:
-        """Return `Atom.gain` of a candidate at given values of its parameters, by name."""
-        item = self.candidates[name]
-        count = len(item.system.parameters) - len(item.parameters)
-        own = [parameters[q.name] for q in item.parameters]
-        p = np.concatenate([self.evidence.p[:count], own])
-        return self._gain(item, p, self._slopes(item, [p]))
-
     def _slopes(self, item: Candidate, probes: Sequence[Array]) -> dict[int, Array]:
         """Return `Atom.slopes` at the m ``probes``, (n_p,) each, which share internal states."""
         e, system = self.evidence, item.system
@@ -159,16 +149,13 @@ class Dictionary:
         """Return `Atom.gain`; a candidate with ``slopes`` is no filter."""
         if slopes or item.linear_indices or not item.system.force_fed:
             return np.ones(len(self.samples))
-        return gain_of_filter(self._spectra, self._spectra_of(item.system, p), self.evidence.band)
+        e = self.evidence
+        return gain_of_filter(self._spectra, e.spectra_of(item.system, p), e.band)
 
     @cached_property
     def _spectra(self) -> Spectra:
         """Spectra of the force that the model applies."""
-        return find_spectra(self.evidence.thin(lambda at: at.applied))
-
-    def _spectra_of(self, system: System, p: Array) -> Spectra:
-        e = self.evidence
-        return find_spectra(e.thin(lambda at: ModelOnTrial(system, p, [at.motion]).applied))
+        return self.evidence.spectra_of(self.evidence.system, self.evidence.p)
 
     def scale_without(
         self, name: str, absence: Mapping[int, float]
@@ -189,7 +176,7 @@ class Dictionary:
         )
         if slopes or all(e.system.linear[i] for i in moved):
             return slopes, unchanged
-        return slopes, 1.0 / gain_of_filter(self._spectra_of(e.system, p), self._spectra, e.band)
+        return slopes, 1.0 / gain_of_filter(e.spectra_of(e.system, p), self._spectra, e.band)
 
 
 _MULTIPLE = (0.5, 2.0)

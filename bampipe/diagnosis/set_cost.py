@@ -84,6 +84,12 @@ class SetCosts:
         self.applied = [max(float(f @ f), 1e-300) for f in problem.likelihood.applied]
         # Columns that take part of the measured force scale or filter its noise, too.
         self._moves_noise = True
+        own = dictionary.evidence.system
+        self._own_delays = {
+            item.name
+            for item in own.model.effects
+            if own.takes_timing and any(q.name in own.delays for q in item.parameters)
+        }
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
         self.ensure(grid)
         places = {key: atom for key in grid if (atom := self.atoms[key]) is not None}
@@ -136,9 +142,11 @@ class SetCosts:
 
     def on_replicate(self, number: int) -> Self:
         """Return the costs on the residual of a replicate instead of the measured one."""
-        other, likelihood = copy(self), self.problem.likelihood
-        rows = zip(likelihood.noise.residuals, likelihood.root, strict=True)
-        other._set_problem(replace(self.problem, y=tuple(r[number] * root for r, root in rows)))
+        other, p = copy(self), self.problem
+        rows = zip(p.likelihood.noise.residuals, p.likelihood.root, strict=True)
+        y = tuple(residuals[number] * root for residuals, root in rows)
+        unscaled = np.zeros_like(p.log_scale_by_parameter)
+        other._set_problem(replace(p, y=y, log_scale_by_parameter=unscaled))
         other._moves_noise = False
         return other
 
@@ -183,7 +191,12 @@ class SetCosts:
     def _solve(self, all_keys: tuple[Key, ...]) -> Solution:
         p, nb = self.problem, self.bb.shape[1]
         absent, keys = p.removal(removed_effects(all_keys)), added_effects(all_keys)
-        if any(self.atoms.get(key) is None for key in keys):
+        # Two delays of the same forces, or one beside the nuisance parameter, make a low-pass.
+        delays = sum(self.dictionary.candidates[name].takes_timing for name, _ in keys)
+        if delays:
+            absent |= p.no_delay
+        delays += bool(self._own_delays.difference(removed_effects(all_keys)))
+        if delays > 1 or any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
         xx, xy, places = self._sums(keys)
         limits = [pair for key in keys for pair in self.dictionary.bounds(key[0])]
@@ -206,14 +219,13 @@ class SetCosts:
             return Solution(np.inf)
         # The cost contains the scale to second order in the model's parameters, absent ones too.
         places_of, change = list(absent), np.array([*absent.values()])
-        first = self.dictionary.evidence.log_scale[1][:, places_of] @ change
+        first = p.log_scale_by_parameter[:, places_of] @ change
         volume = volume - p.independent * (first - 0.5 * first**2)
         sizes = list[float]()
         # The cost of the model does not contain the priors of its own effects.
         penalty = self.penalty_of(all_keys) + 0.5 * float(b[nb:] @ expected @ b[nb:])
         if keys:
-            products = np.tensordot(weight, xx, 1)
-            normal = products.copy()
+            normal = np.tensordot(weight, xx, 1)
             normal[:nb, :nb] += p.precision
             normal[nb:, nb:] += expected
             used = np.flatnonzero(~solved.held)
@@ -229,10 +241,7 @@ class SetCosts:
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
             member = np.repeat(np.arange(len(keys)), [h.stop - h.start for h in held])[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
-            small = (k for k, size in enumerate(sizes) if size < self.least_size)
-            # Other parameters absorb an effect only within their bounds.
-            within = (self._size_within_bounds(all_keys, k, strengths, b, products) for k in small)
-            if any(size < self.least_size for size in within):
+            if any(size < self.least_size for size in sizes):
                 return Solution(np.inf)
             shapes = sum(len(key[1]) for key in keys)
             penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
@@ -286,31 +295,6 @@ class SetCosts:
             sizes.append(self._size(key, strength) * float(np.sqrt(max(share, 0.0))))
         return sizes
 
-    def _size_within_bounds(
-        self,
-        all_keys: tuple[Key, ...],
-        number: int,
-        strengths: Sequence[Array],
-        b: Array,
-        products: Array,
-    ) -> float:
-        """Return the size of one effect of a set beyond what the set without it could absorb.
-
-        ``b`` are all unknowns, (n,), and ``products`` the weighted products of all columns, (n, n).
-        """
-        key = added_effects(all_keys)[number]
-        rest = self.solve(tuple(other for other in all_keys if other != key))
-        if not np.isfinite(rest.cost):
-            return 0.0
-        others = [*rest.strengths[:number], np.zeros_like(strengths[number]),
-                  *rest.strengths[number:]]  # fmt: skip
-        moved = b - np.concatenate([rest.base, *others])
-        start = len(rest.base) + sum(map(len, strengths[:number]))
-        alone = slice(start, start + len(strengths[number]))
-        whole = float(b[alone] @ products[alone, alone] @ b[alone])
-        share = float(moved @ products @ moved) / max(whole, 1e-300)
-        return self._size(key, strengths[number]) * float(np.sqrt(max(share, 0.0)))
-
     def _size(self, key: Key, strength: Array) -> float:
         """Return the root mean square of an effect over that of the applied force of an axis."""
         return max(
@@ -333,12 +317,10 @@ class SetCosts:
 
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
         """Return the change of variables of a set at the parameters of a model fitted with it."""
-        known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
-        gains = [self.dictionary.gain_with(name, known) for name, _ in added_effects(keys)]
-        gains += [self._without(name)[1] for name in removed_effects(keys)]
-        filters: list[tuple[dict[int, Array], Array]] = [({}, gain) for gain in gains]
-        scale = evidence.log_scale[0] - self.dictionary.evidence.log_scale[0]
-        rows = self._log_of_slopes(filters, self.solve(keys).scale)
+        base = self.dictionary.evidence
+        gain, scale = evidence.filter_gain[0] / base.filter_gain[0], self.solve(keys).scale
+        rows = self._log_of_slopes([({}, gain)], scale)
+        scale = evidence.log_scale[0] - base.log_scale[0]
         return self._volume([r + here for r, here in zip(rows, scale, strict=True)])
 
     def _volume(self, rows: Sequence[Array]) -> Array | None:
@@ -381,13 +363,12 @@ class SetCosts:
             for axis, slope in slopes.items():
                 moved[axis] = moved.get(axis, 0.0) + slope
             gains *= gain
-        # A filter reduces the noise of the forces and any excess over the replicates, but not the
-        # noise of the motion.
+        likelihood = self.problem.likelihood
         for axis in map(int, np.flatnonzero(gains != 1.0)):
-            kept = (1.0 - self.problem.likelihood.force_share[axis]) / max(float(scale[axis]), 1.0)
-            found[axis] = found[axis] + 0.5 * np.log(kept + (1.0 - kept) * gains[axis])
+            filtered = likelihood.log_of_filter(axis, gains[axis], float(scale[axis]))
+            found[axis] = found[axis] + filtered
         for axis, slope in moved.items():
-            found[axis] = found[axis] + log_of_share(self.problem.likelihood.slopes[axis], slope)
+            found[axis] = found[axis] + log_of_share(likelihood.slopes[axis], slope)
         return found
 
     def penalty_of(self, keys: Sequence[Key]) -> float:

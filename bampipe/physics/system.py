@@ -104,14 +104,29 @@ class System:
     @cached_property
     def parameters_by_force(self) -> frozenset[int]:
         """Numbers of the parameters of effects that alone change how a measured force acts."""
-        names, found = [q.name for q in self.parameters], set[int]()
+        return frozenset(k for own, alone in self._effects_on_force for k in own)
+
+    @cached_property
+    def filter_strengths(self) -> list[int]:
+        """Numbers of the strengths of filters: a state follows the force, not in proportion."""
+        return [
+            k
+            for own, alone in self._effects_on_force
+            for k in own
+            if alone.force_fed and self.parameters[k].strength and not self.linear[k]
+        ]
+
+    @cached_property
+    def _effects_on_force(self) -> list[tuple[list[int], System]]:
+        """Each effect that changes how a force acts: numbers of its parameters, and it alone."""
+        names, found = [q.name for q in self.parameters], list[tuple[list[int], System]]()
         for item in self.model.effects if self.driven or self.force_fed else ():
             if item.effect.ahead is not None:
                 continue
             alone = compile_model(Model(self.model.device, (item.name,), (item.effect,)))
             if alone.driven or alone.force_fed:
-                found |= {names.index(q.name) for q in item.parameters}
-        return frozenset(found)
+                found.append(([names.index(q.name) for q in item.parameters], alone))
+        return found
 
     @cached_property
     def forced(self) -> tuple[int, ...]:

@@ -23,11 +23,19 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.motion import Motion, join_short, trial_sizes
 from bampipe.trials.residuals import ModelOnTrial, problem_of, rms
-from bampipe.trials.scale import log_scale, slopes_by_force
+from bampipe.trials.scale import (
+    Spectra,
+    find_spectra,
+    gain_of_filter,
+    log_scale,
+    slopes_by_force,
+)
 
 _CONVERGED = 1e-8
 """Change of the negative log likelihood per sample at which a fit ends: a hundredth of a
 parameter's standard deviation over ten thousand samples."""
+_STEP = 0.01
+"""Finite-difference step of a filter's strength, relative to it."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +140,32 @@ class Evidence:
             self.slopes_by_force if self.system.parameters_by_force else (),
         )  # fmt: skip
         return value, np.pad(slopes, ((0, 0), (0, 1 if self.by_timing else 0)))
+
+    @cached_property
+    def filter_gain(self) -> tuple[Array, Array]:
+        """Share of the variance of white force noise that passes the model's filters, and slopes.
+
+        Within the band, by axis: (n_q,), and (n_q, n) by the same parameters as `slopes`.
+        """
+        n_q, strengths = len(self.system.coordinates), self.system.filter_strengths
+        gain, slopes = np.ones(n_q), np.zeros((n_q, len(self.free) + (1 if self.by_timing else 0)))
+        without = self.p.copy()
+        without[strengths] = 0.0
+        if (without == self.p).all():
+            return gain, slopes
+        before = self.spectra_of(self.system, without)
+        gain = gain_of_filter(before, self.spectra_of(self.system, self.p), self.band)
+        for number in {*strengths} & {*self.free}:
+            longer = self.p.copy()
+            longer[number] *= 1.0 + _STEP
+            there = gain_of_filter(before, self.spectra_of(self.system, longer), self.band)
+            change = max(longer[number] - self.p[number], 1e-300)
+            slopes[:, self.free.index(number)] = (there - gain) / change
+        return gain, slopes
+
+    def spectra_of(self, system: System, p: Array) -> Spectra:
+        """Spectra of the force that a model with the same coordinates applies, `find_spectra`."""
+        return find_spectra(self.thin(lambda at: ModelOnTrial(system, p, [at.motion]).applied))
 
     @property
     def sizes(self) -> list[int]:

@@ -120,6 +120,18 @@ class Likelihood:
             found.append(np.minimum(of_force / np.maximum(variance, 1e-300), 1.0))
         return tuple(found)
 
+    def log_of_filter(self, axis: int, gain: float, scale: float) -> Array:
+        """Log of the factor of a filter on the density of the measured force, (n,).
+
+        It reduces the noise of the forces and any excess over the replicates, but not the noise of
+        the motion.
+
+        Args:
+            gain: share of the variance of force noise that passes; scale: s^2 of the axis.
+        """
+        kept = (1.0 - self.force_share[axis]) / max(scale, 1.0)
+        return np.asarray(0.5 * np.log(kept + (1.0 - kept) * gain))
+
     def with_equal_weights(self, left: Iterable[Array], lacking: float) -> Likelihood:
         """Give all samples equal weight on axes where the scale of a fit exceeds ``lacking``.
 

@@ -94,20 +94,36 @@ def pose_problem(likelihood: Likelihood, evidence: Evidence) -> LinearProblem:
     kept = values > _DETERMINED * values[-1]
     to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
     loose = vectors[:, ~kept] * per_unit[:, None]
-    log_scale, by_parameters = evidence.log_scale
-    by_parameters = np.pad(by_parameters, ((0, 0), (0, 2 * n_q)))
+    log_scale, by_parameter = _log_scale_with_filters(likelihood, evidence, y)
+    by_parameter = np.pad(by_parameter, ((0, 0), (0, 2 * n_q)))
     return LinearProblem(
         likelihood, KeptItems(y), KeptItems(map(combined_columns, range(n_q))),
         to.T @ known_precision @ to, to.T @ moment, log_scale,
-        by_parameters @ to, to, lower, upper,
+        by_parameter, to, lower, upper,
         {
             # Without a strength the data say nothing of the shape: it does not move to its prior.
             item.name: {k: -float(p[k]) for k in own} | dict.fromkeys(others, 0.0)
             for item, own, others in zip(effects, strengths, shapes, strict=True)
         },
         {item.name: tuple(own) for item, own in zip(effects, shapes, strict=True)},
-        cost_of_known, loose,
+        cost_of_known, loose, dict.fromkeys(range(len(evidence.free), n), 0.0),
     )  # fmt: skip
+
+
+def _log_scale_with_filters(
+    likelihood: Likelihood, evidence: Evidence, y: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Return `Evidence.log_scale` with the factors of the model's filters on force noise."""
+    value, slopes = (x.copy() for x in evidence.log_scale)
+    gains, by_parameter = evidence.filter_gain
+    for axis in map(int, np.flatnonzero(by_parameter.any(axis=1))):
+        scale = float(np.mean(y[axis] ** 2))
+        rows = likelihood.log_of_filter(axis, gains[axis], scale)
+        value[axis] += rows.mean()
+        # The slope of the logarithm by the gain, from the logarithm itself.
+        more = likelihood.log_of_filter(axis, gains[axis] * (1.0 + 1e-6), scale)
+        slopes[axis] += (more - rows).mean() / (1e-6 * gains[axis]) * by_parameter[axis]
+    return value, slopes
 
 
 def _find_places(evidence: Evidence, parameters: Sequence[Parameter]) -> list[int]:
@@ -138,13 +154,14 @@ class LinearProblem:
             the model's parameters.
         known_precision, known_moment: (P, P) and (P,), the priors of these.
         log_scale: mean log of the fraction of the measured quantity that the effects leave, by
-            axis, (n_q,); log_scale_slopes: its slopes by the same combinations, (n_q, P).
+            axis, (n_q,); log_scale_by_parameter: its slopes by the parameters, (n_q, n_all).
         to_parameters: (n_all, P), from these to the free parameters, nuisance parameters last.
         lower, upper: bounds of the change of the parameters, (n_all,).
         absence: by effect, the change of each of its free parameters (by index) that removes it.
         shapes: by effect, the indices of its free shape parameters.
         cost_of_known: negative log density of the priors if nothing changes.
         loose: (n_all, m) directions of the parameters in which nothing measured changes.
+        no_delay: the change of the input delay, by index, if that is fitted: none.
     """
 
     likelihood: Likelihood
@@ -153,7 +170,7 @@ class LinearProblem:
     known_precision: Array
     known_moment: Array
     log_scale: Array
-    log_scale_slopes: Array
+    log_scale_by_parameter: Array
     to_parameters: Array
     lower: Array
     upper: Array
@@ -161,6 +178,7 @@ class LinearProblem:
     shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     cost_of_known: float = 0.0
     loose: Array | None = None
+    no_delay: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def independent(self) -> Array:
@@ -171,6 +189,11 @@ class LinearProblem:
     def count(self) -> Array:
         """Number of samples of each axis, at least one, (n_q,)."""
         return np.array([max(float(len(y)), 1.0) for y in self.y])
+
+    @cached_property
+    def log_scale_slopes(self) -> Array:
+        """Slopes of ``log_scale`` by the combinations of ``base``, (n_q, P)."""
+        return np.asarray(self.log_scale_by_parameter @ self.to_parameters)
 
     @property
     def moment(self) -> Array:

@@ -6,7 +6,7 @@ With estimates of its constants, a form is an effect file like any other.
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 
@@ -160,6 +160,7 @@ class Form:
         scale: highest speed or acceleration of the axis if that is the factor, else 1.
         other_quantities: further quantities, ``x2``, ``x3`` in the shape, and their ranges.
         prefix: prefix of its name if a model has two terms of one form.
+        takes_timing: as of a `Candidate`; no form delays a force.
     """
 
     axis: Axis
@@ -172,6 +173,7 @@ class Form:
     scale: float
     other_quantities: tuple[tuple[Quantity, Span], ...] = ()
     prefix: str = ""
+    takes_timing: ClassVar[bool] = False
 
     @property
     def quantities(self) -> tuple[tuple[Quantity, Span], ...]:
