@@ -14,12 +14,9 @@ from bampipe.report import style
 from bampipe.report.build import Report
 from bampipe.report.document import Block, Callout, Document, Paragraph, Section, Table, Tone
 from bampipe.report.wording import (
-    NONE,
     choose_scale,
     format_digits,
     format_p_value,
-    format_unit,
-    format_with_sd,
     name_parameter,
     split_name,
 )
@@ -84,17 +81,14 @@ def _summarise(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
     }
     rows = [
         (
-            links.get(one.session, one.session),
-            one.recorded[:16].replace("T", " ") or NONE,
-            f"`{one.model}`",
-            f"{format_digits(one.worst[0])} ({one.worst[1]})" if one.worst else NONE,
-            ", ".join(moved.parameter for moved in one.moved) or NONE,
-            verdicts[one.session],
+            *(links.get(one.session, one.session), one.recorded[:16].replace("T", " ") or None),
+            *(one.model, f"{format_digits(one.worst[0])} ({one.worst[1]})" if one.worst else None),
+            *(", ".join(moved.parameter for moved in one.moved) or None, verdicts[one.session]),
         )
         for one in trends.sessions
     ]
     columns = (
-        "Session | Recorded (UTC) | Best confirmed model ~1.2 | >Error / floor, worst axis"
+        "Session | Recorded (UTC) | Best confirmed model :code ~1.2 | >Error / floor, worst axis"
         " | Beyond its limits ~1 | Verdict ~0.8"
     )
     note = "Error of that model on unseen trials over the noise floor of sensors and filters."
@@ -191,27 +185,18 @@ def _tabulate_charts(charts: list[ControlChart]) -> Table:
     rows = []
     for chart in charts:
         within, centre = float(np.median([point.sd for point in chart.points])), chart.centre
-        trend = NONE
+        trend = None
         if chart.slope_per_session is not None and centre:
             slope = format_digits(100.0 * chart.slope_per_session / abs(centre), 2)
             trend = f"{slope} % (p {format_p_value(chart.slope_p)})"
-        rows.append(
-            (
-                name_parameter(chart.name),
-                # Without control limits the scatter of the centre is not known.
-                format_with_sd(centre, chart.between_sd or within)
-                if chart.has_limits
-                else format_digits(centre),
-                format_unit(chart.unit),
-                format_digits(chart.between_sd, 2),
-                format_digits(within, 2),
-                trend,
-                "; ".join(phrases.list_signs(chart)) or NONE,
-            )
-        )
+        # Without control limits the scatter of the centre is not known.
+        shown = (centre, chart.between_sd or within) if chart.has_limits else centre
+        signs = "; ".join(phrases.list_signs(chart)) or None
+        rows.append((chart.name, shown, chart.unit, chart.between_sd, within, trend, signs))
     return Table(
         "Centre and scatter of each parameter",
-        "Parameter | >Centre | Unit | >Between | >Within | >Trend a session | Signs ~1",
+        "Parameter :name | >Centre | Unit :unit | >Between :2 | >Within :2 | >Trend a session"
+        " | Signs ~1",
         rows,
         "Between: scatter between sessions, without the uncertainty within them. Within: median "
         "standard deviation of a session's estimate. Trend: median slope (Theil and Sen), and the "
@@ -273,12 +258,12 @@ def _show_trials(folder: Path) -> Iterator[Section]:
     if not odd.empty:
         rows = [
             (
-                str(row["session_id"]),
-                str(row["trial_id"]),
-                split_name(str(row["status"])),
-                str(row["reason"] or row["repairs"] or NONE),
+                one.session_id,
+                one.trial_id,
+                split_name(one.status),
+                one.reason or one.repairs or None,
             )
-            for row in odd.head(_MOST_TRIALS).to_dict("records")
+            for one in odd.head(_MOST_TRIALS).itertuples()
         ]
         more = len(odd) - _MOST_TRIALS
         note = f"{more} more in the table `quality`." if more > 0 else ""

@@ -49,7 +49,7 @@ def _sheet(
         blocks.append(_tabulate_uncertainties(plan, model, listed))
     if plan.confusion:
         title = "Probability of confusion"
-        blocks.append(tabulate_confusion(title, ">now | >expected", plan.confusion))
+        blocks.append(tabulate_confusion(title, ("now", "expected"), plan.confusion))
     before = (_BY_HAND if by_hand else _BY_DRIVE, *_BEFORE)
     sections = [Section("The trials", tuple(blocks))]
     if plan.trials:

@@ -19,14 +19,7 @@ from bampipe.report.document import (
 )
 from bampipe.report.run_results import Results
 from bampipe.report.sections import next_trial
-from bampipe.report.wording import (
-    format_decimals,
-    format_digits,
-    format_p_value,
-    format_percent,
-    format_unit,
-    split_name,
-)
+from bampipe.report.wording import format_decimals, format_digits, format_unit, split_name
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import (
     AxisVerdict,
@@ -114,12 +107,11 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
     for axis, one in axes.items():
         errors = (one.rmse_before, one.rmse_after, one.rmse_beyond_bias, one.noise_floor)
         words, share = phrases.verdict(found, axis), phrases.percent_of_force(one.explained)
-        left = format_percent(one.explainable_share)
-        rows.append((axis, words, share, *map(format_digits, errors), format_unit(one.unit), left))
+        rows.append((axis, words, share, *errors, one.unit, one.explainable_share))
     return Table(
         "Verdict by axis",
-        "Axis | Verdict ~1 | >Explained | >Error now | >with the set | >beyond bias | >Floor | Unit"
-        " | >Explainable",
+        "Axis | Verdict ~1 | >Explained | >Error now | >with the set | >beyond bias | >Floor"
+        " | Unit :unit | >Explainable :%",
         rows,
         "Probabilities are in brackets. Explained: share of the mean square of the applied force "
         "that the model with the most probable set of effects explains. Errors are RMSE on "
@@ -134,13 +126,10 @@ def _tabulate_sets(found: DiagnoseResult) -> Iterator[Block]:
     """Yield the probable sets of effects, if there are several, and the null distribution."""
     shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
     if len(shown) > 1:
+        first = shown[0].log_evidence
         rows = [
-            (
-                phrases.name_set(one, "`"),
-                phrases.probability(one.probability),
-                format_digits(one.log_evidence - shown[0].log_evidence),
-            )
-            for one in shown[:_MOST_RANKED]
+            (phrases.name_set(s, "`"), phrases.probability(s.probability), s.log_evidence - first)
+            for s in shown[:_MOST_RANKED]
         ]
         columns = "Effects | >Probability | >Log evidence over the first (nats)"
         yield Table("Sets of effects, the most probable first", columns, rows)
@@ -158,16 +147,11 @@ def tabulate_candidates(
     """
     return Table(
         title,
-        f"Effect | {about} | >Without | >With | Unit | >Probability | >p",
+        f"Effect :code | {about} | >Without | >With | Unit :unit | >Probability | >p :p",
         [
             (
-                f"`{one.effect}`",
-                *more,
-                format_digits(one.held_out_rmse_before),
-                format_digits(one.held_out_rmse_after),
-                format_unit(one.unit),
-                phrases.probability(one.probability),
-                format_p_value(one.p_value),
+                *(one.effect, *more, one.held_out_rmse_before, one.held_out_rmse_after),
+                *(one.unit, phrases.probability(one.probability), one.p_value),
             )
             for one, more in rows
         ],

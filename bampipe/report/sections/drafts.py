@@ -9,7 +9,7 @@ from bampipe.lists import join_names
 from bampipe.report import style
 from bampipe.report.document import Block, Figure, Formulas, Paragraph, Subheading, Table
 from bampipe.report.run_results import Results
-from bampipe.report.wording import format_digits, format_unit, split_name
+from bampipe.report.wording import split_name
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
 from bampipe.results.draft import AxisDraft, DraftedEffect, DraftResult
 
@@ -130,8 +130,6 @@ def _draw_gains(panel: Axes, entry: AxisDraft) -> None:
 def _tabulate_nearest(entry: AxisDraft) -> Table:
     errors = {"the draft": entry.rmse_after}
     errors |= {f"`{near.effect}`": near.held_out_rmse for near in entry.nearest}
-    return Table(
-        "Most similar effects of the library: error on held-out trials",
-        "Effect | >With it | Unit",
-        [(name, format_digits(x), format_unit(entry.unit)) for name, x in errors.items()],
-    )
+    title = "Most similar effects of the library: error on held-out trials"
+    rows = [(name, error, entry.unit) for name, error in errors.items()]
+    return Table(title, "Effect | >With it | Unit :unit", rows)

@@ -75,15 +75,13 @@ def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:
         half = NORMAL_95 * sd
         rows.append(
             (
-                name_parameter(name),
-                f"`{name}`",
-                format_decimals(value, *digits) + (" *" if one.at_bound else ""),
-                format_digits(sd, 2) if sd else "fixed",
-                format_digits(one.calibration_sd or 0.0, 2) if calibrated else "",
-                "" if one.bound_sd is None else format_digits(one.bound_sd, 2),
-                format_interval(value - half, value + half, sd) if sd else "–",
+                *(name, name, format_decimals(value, *digits) + (" *" if one.at_bound else "")),
+                sd or "fixed",
+                (one.calibration_sd or 0.0) if calibrated else "",
+                "" if one.bound_sd is None else one.bound_sd,
+                format_interval(value - half, value + half, sd) if sd else None,
                 *(format_decimals(found[name].estimate, *digits) for found in others.values()),
-                format_unit(one.unit),
+                one.unit,
             )
         )
     note = f"Interval: estimate ± 1.96 standard deviations{_qualify_intervals(results)}."
@@ -102,8 +100,8 @@ def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:
     return Table(
         f"Parameters of model `{identified.model}`, {METHODS[identified.method]}"
         f"{results.cite_paper('Table VII')}",
-        "Parameter ~1.1 | Name ~1 | >Estimate | >SD | >Calibration | >Bound | >95 % interval"
-        f"{''.join(heads)} | Unit",
+        "Parameter :name ~1.1 | Name :code ~1 | >Estimate | >SD :2 | >Calibration :2 | >Bound :2"
+        f" | >95 % interval{''.join(heads)} | Unit :unit",
         rows,
         note,
     ).drop_empty_columns()
@@ -133,20 +131,14 @@ def _select_parameters(identified: IdentifyResult) -> Mapping[str, ParameterEsti
 
 
 def _tabulate_combinations(bases: Sequence[BaseEstimate]) -> Table:
-    rows = [
-        (
-            base.combination,
-            format_decimals(base.estimate, *find_digits(base.estimate, base.sd)),
-            format_digits(base.sd, 2),
-            format_with_sd(base.drawn, base.drawn_sd),
-            "yes" if base.shown else "no",
-            format_unit(base.unit),
-        )
-        for base in bases
-    ]
+    rows = []
+    for one in bases:
+        estimate = format_decimals(one.estimate, *find_digits(one.estimate, one.sd))
+        drawn = (one.drawn, one.drawn_sd)
+        rows.append((one.combination, estimate, one.sd, drawn, one.shown, one.unit))
     return Table(
         "Combinations of inertial numbers that motion determines",
-        "Combination ~3 | >Estimate | >SD | >Drawing | Shown | Unit",
+        "Combination ~3 | >Estimate | >SD :2 | >Drawing | Shown | Unit :unit",
         rows,
         "Shown: whether its SD is less than half of that of the drawing.",
     )

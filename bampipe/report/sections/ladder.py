@@ -14,8 +14,6 @@ from bampipe.report.wording import (
     format_decimals,
     format_digits,
     format_unit,
-    format_with_sd,
-    name_parameter,
     split_name,
 )
 from bampipe.results.compare import CompareResult, Rung, Value, horizons_of
@@ -84,11 +82,10 @@ def _tabulate_free_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
     )
     rows = []
     for number, rung in enumerate(rungs):
-        cells = []
+        cells: list[float | None] = []
         for axis, (factor, _) in scales.items():
             one = runs[axis][number]
-            cells.append(format_digits(factor * one.mean_absolute if one else None))
-            cells.append(format_digits(one.relative_error_percent if one else None))
+            cells += [factor * one.mean_absolute, one.relative_error_percent] if one else [None] * 2
         rows.append((_name_version(rungs, rung), split_name(rung.free_run_mode or NONE), *cells))
     heads = (f">{axis} ({unit}) | >relative (%)" for axis, (_, unit) in scales.items())
     reasons = (
@@ -192,11 +189,11 @@ def _tabulate_parameters(
     for name in results.order_parameters(parameters):
         values = [parameters[name].get(rung.model) for rung in shown]
         unit = next((one.unit for one in values if one), "")
-        cells = [format_with_sd(one.estimate, one.sd) if one else NONE for one in values]
-        rows.append((name_parameter(name), *cells, format_unit(unit)))
+        rows.append((name, *((one.estimate, one.sd) if one else None for one in values), unit))
+    heads = (f">{_name_version(rungs, rung)}" for rung in shown)
     return Table(
         "Parameters of each version (± one standard deviation): a missing effect biases the others",
-        " | ".join(("Parameter", *(f">{_name_version(rungs, rung)}" for rung in shown), "Unit")),
+        " | ".join(("Parameter :name", *heads, "Unit :unit")),
         rows,
-        "–: not in that version." if any(NONE in row for row in rows) else "",
+        "–: not in that version." if any(None in row for row in rows) else "",
     )

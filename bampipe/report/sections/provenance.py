@@ -24,9 +24,9 @@ def list_blocks(results: Results) -> Iterator[Block]:
     yield Paragraph(_list_versions(stages))
     if "ingest" in stages:
         read = stages["ingest"].inputs
-        rows = [(f"`{name}`", f"`{digest[:_DIGITS]}`") for name, digest in read.items()]
+        rows = [(name, digest[:_DIGITS]) for name, digest in read.items()]
         title = f"Files that were read (first {_DIGITS} digits of their hash)"
-        yield Table(title, "File | Hash", rows)
+        yield Table(title, "File :code | Hash :code", rows)
     yield _tabulate_stages(stages)
     if settings := _tabulate_settings(stages):
         yield Subheading("Settings")
@@ -44,14 +44,10 @@ def _list_versions(stages: Mapping[str, StepRecord]) -> str:
 
 
 def _tabulate_stages(stages: Mapping[str, StepRecord]) -> Table:
-    rows = [
-        (f"`{name}`", str(len(made.outputs)), f"`{made.key[:_DIGITS]}`")
-        for name, made in _order_stages(stages)
-    ]
     return Table(
         "Stages",
-        "Stage | >Files | Key",
-        rows,
+        "Stage :code | >Files | Key :code",
+        [(n, str(len(made.outputs)), made.key[:_DIGITS]) for n, made in _order_stages(stages)],
         "Key: hash of everything on which the stage depends (inputs, settings, code, versions). "
         "`bampipe status` says when each ran, and for how long.",
     )

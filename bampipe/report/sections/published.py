@@ -26,13 +26,12 @@ def list_blocks(results: Results) -> Iterator[Block]:
     for row in paper["rows"]:
         value, sd = _read_number(results, row, "value"), _read_number(results, row, "sd")
         shown = format_digits(value) if sd is None else format_with_sd(value, sd)
-        place = (row["quantity"], row["place"], row["published"])
-        rows.append((*place, shown, format_unit(row["unit"])))
+        rows.append((row["quantity"], row["place"], row["published"], shown, row["unit"]))
     if results.session.simulated:
         yield _SIMULATED
     yield Table(
         f"{paper['title']}: published values and those of this session",
-        "Quantity | Place | >Paper | >This session | Unit",
+        "Quantity | Place | >Paper | >This session | Unit :unit",
         rows,
         f"Paper: digits as printed there.{_explain_dash(rows)}",
     )

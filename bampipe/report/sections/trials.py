@@ -141,17 +141,11 @@ def _describe_filter(results: Results, filtered: FilterResult) -> Iterator[Block
     if stretches:
         title = "Stretches that no estimate and no error uses"
         yield Table(title, "Trial ~1 | Time (s) ~1 | Why ~6", stretches)
-    rows = [
-        (
-            axis,
-            format_scaled(one.resolution, one.unit),
-            format_digits(one.bandwidth_hz),
-            format_scaled(one.position_sd, one.unit),
-            format_scaled(one.velocity_sd, f"{one.unit}/s"),
-            format_scaled(one.acceleration_sd, f"{one.unit}/s2"),
-        )
-        for axis, one in results.order_axes(filtered.axes).items()
-    ]
+    rows = []
+    for axis, one in results.order_axes(filtered.axes).items():
+        sds = ((one.position_sd, ""), (one.velocity_sd, "/s"), (one.acceleration_sd, "/s2"))
+        shown = (format_scaled(sd, one.unit + per) for sd, per in sds)
+        rows.append((axis, format_scaled(one.resolution, one.unit), one.bandwidth_hz, *shown))
     if rows:
         title = "Encoders and the motion derived from them: typical standard deviations of error"
         columns = (
