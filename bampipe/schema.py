@@ -37,7 +37,9 @@ class Declaration(BaseModel):
     Faults between fields are found by `cross_faults` once every field is valid by itself.
     """
 
-    model_config = ConfigDict(**STRICT, frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        **STRICT, frozen=True, arbitrary_types_allowed=True, use_attribute_docstrings=True
+    )
 
     def cross_faults(self) -> Iterator[InputError]:
         """Yield every fault between the fields; ``where`` is a key below this table, or empty."""

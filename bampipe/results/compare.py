@@ -33,9 +33,8 @@ class Rung(Record):
     )
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
-    free_run_reason: str = Field(
-        default="", description="Why there is no free run, or none in closed loop"
-    )
+    free_run_reason: str = ""
+    """Why there is no free run, or none in closed loop"""
     free_run: dict[str, FreeRunError] = Field(default={}, description="By axis")
     drift: dict[str, AxisDrift] = Field(default={}, description="By axis: short free runs")
 
@@ -96,9 +95,8 @@ class Moved(Record):
 class CompareResult(Result, file="compare.json", stage="compare"):
     """The ladder of model versions on the same held-out trials."""
 
-    best: str = Field(
-        description="The model used by default: the confirmed one with the lowest held-out error"
-    )
+    best: str
+    """The model used by default: the confirmed one with the lowest held-out error"""
     ladder: tuple[Rung, ...] = Field(min_length=1, description="Parents before children")
     parameters: dict[str, dict[str, Value]] = Field(description="By name, then by model")
     moved: tuple[Moved, ...]

@@ -76,9 +76,8 @@ class Journey(Record):
     effects: Names = Field(description="Of the model")
     axes: dict[str, Travel]
     alone: tuple[Refit, ...] = Field(default=(), description="Single parameters, best first")
-    together: Refit | None = Field(
-        default=None, description="Parameters added one at a time, the most useful first"
-    )
+    together: Refit | None = None
+    """Parameters added one at a time, the most useful first"""
     lacking: dict[str, AxisVerdict] = Field(
         default={},
         description="By axis: verdict on a model with the same effects in the other session, where"
