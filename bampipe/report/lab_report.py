@@ -168,8 +168,7 @@ def _draw_chart(panel: Axes, chart: ControlChart) -> None:
         )  # fmt: skip
     style.set_limits(panel, shown)
     _name_sessions(panel, [point.session for point in points])
-    panel.set_title(name_parameter(chart.name))
-    panel.set_ylabel(unit)
+    panel.set(title=name_parameter(chart.name), ylabel=unit)
 
 
 def _name_sessions(panel: Axes, names: list[str]) -> None:
@@ -230,10 +229,8 @@ def _show_errors(folder: Path, trends: TrendsResult) -> Iterator[Section]:
         ticks = [tick for tick in _TICKS if low <= tick]
         panel.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
         panel.minorticks_off()
-        panel.set_ylim(low, high)
         _name_sessions(panel, sessions)
-        panel.set_title(axis)
-        panel.set_ylabel("error / floor")
+        panel.set(ylim=(low, high), title=axis, ylabel="error / floor")
     caption = "Error on unseen trials over the noise floor, session by session."
     text = (
         "The noise floor is the error that sensors and filters leave if the model is exactly "

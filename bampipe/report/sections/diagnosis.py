@@ -161,16 +161,14 @@ def tabulate_candidates(
 
 
 def _tabulate_ranking(ranking: Sequence[RankedEffect]) -> Table:
-    shown, more = ranking[:_MOST_RANKED], len(ranking) - _MOST_RANKED
     rows = [
-        (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from))) for one in shown
+        (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)))
+        for one in ranking[:_MOST_RANKED]
     ]
-    return tabulate_candidates(
-        "Candidate effects, best first",
-        rows,
-        "Axis | Indistinguishable from",
-        f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else "",
-    ).drop_empty_columns()
+    more = len(ranking) - _MOST_RANKED
+    note = f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else ""
+    title, about = "Candidate effects, best first", "Axis | Indistinguishable from"
+    return tabulate_candidates(title, rows, about, note).drop_empty_columns()
 
 
 def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Figure:
@@ -193,53 +191,36 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
 
 def draw_maps(panel: Any, name: str, shown: Sequence[tuple[ResidualMap, str, str]]) -> None:
     """Draw maps of one variable into a panel, each with its colour and its title."""
-    for one in shown:
-        _draw_map(panel, name, *one)
+    bands = []
+    for one, colour, title in shown:
+        mean, low, high = (np.array(values) for values in (one.mean, one.low, one.high))
+        bands += [low, high]
+        if one.unit or not all(value.is_integer() for value in one.center):
+            x, unit = style.scale_values(np.array(one.center), one.unit)
+            panel.fill_between(x, low, high, color=colour, alpha=0.2, lw=0)
+            panel.plot(x, mean, color=colour, lw=1.1, label=title)
+            panel.set_xlabel(style.label_axis(split_name(name), unit))
+        else:  # a discrete variable
+            signs = {-1: "−", 0: "0", 1: "+"} if name == "direction" else {}
+            numbers = [int(value) for value in one.center]
+            names = [signs.get(n, str(n + (name == "trial"))) for n in numbers]
+            places = np.arange(len(names), dtype=float)
+            spread = np.abs(np.vstack([mean - low, high - mean]))
+            panel.errorbar(places, mean, spread, color=colour, fmt="o", ms=3, lw=1.0, label=title)
+            panel.set_xticks(places, names)
+            panel.set(xlim=(-0.5, len(names) - 0.5), xlabel=split_name(name))
     panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
-    bands = [np.array(values) for one, _, _ in shown for values in (one.low, one.high)]
     style.set_limits(panel, bands, zero=True)
-
-
-def _draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str) -> None:
-    """Draw the mean residual with its band over one variable of a map."""
-    mean, low, high = (np.array(values) for values in (shown.mean, shown.low, shown.high))
-    values = None if shown.unit else _name_values(name, shown.center)
-    if values is None:
-        x, unit = style.scale_values(np.array(shown.center), shown.unit)
-        panel.fill_between(x, low, high, color=colour, alpha=0.2, lw=0)
-        panel.plot(x, mean, color=colour, lw=1.1, label=title)
-        panel.set_xlabel(style.label_axis(split_name(name), unit))
-        return
-    places = np.arange(len(values), dtype=float)
-    spread = np.abs(np.vstack([mean - low, high - mean]))
-    panel.errorbar(places, mean, spread, color=colour, fmt="o", ms=3, lw=1.0, label=title)
-    panel.set_xticks(places, values)
-    panel.set_xlim(-0.5, len(values) - 0.5)
-    panel.set_xlabel(split_name(name))
-
-
-def _name_values(name: str, centre: Sequence[float]) -> list[str] | None:
-    """Return the names of the values of a discrete variable, else None."""
-    if not all(value.is_integer() for value in centre):
-        return None
-    first = 1 if name == "trial" else 0
-    signs = {-1: "−", 0: "0", 1: "+"} if name == "direction" else {}
-    return [signs.get(int(value), str(int(value) + first)) for value in centre]
 
 
 def _tabulate_windows(windows: Sequence[WorstWindow]) -> Table:
     rows = [
         (
-            one.axis,
-            one.trial_id,
+            *(one.axis, one.trial_id),
             f"{format_decimals(one.t_start, 1)} to {format_decimals(one.t_end, 1)}",
-            f"{format_digits(one.rmse)} {format_unit(one.unit)}",
-            one.doing or "–",
+            *(f"{format_digits(one.rmse)} {format_unit(one.unit)}", one.doing or None),
         )
         for one in windows[:_MOST_WINDOWS]
     ]
-    return Table(
-        "Worst windows: where the prediction fails most, and how the machine moved there",
-        "Axis | Trial | Time (s) | >RMSE | Motion ~1",
-        rows,
-    )
+    title = "Worst windows: where the prediction fails most, and how the machine moved there"
+    return Table(title, "Axis | Trial | Time (s) | >RMSE | Motion ~1", rows)

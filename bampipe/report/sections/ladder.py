@@ -143,11 +143,9 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
             style.use_decades(panel, both)
         else:
             panel.set_ylim(0.0, 1.1 * both.max(initial=0.0) or 1.0)
-        panel.set_xlim(-0.4, len(rungs) - 0.6)
         panel.set_xticks(x, _name_ticks(rungs[0].model, error))
-        panel.set_xlabel("version, and its error")
-        panel.set_title(axis)
-        panel.set_ylabel(style.label_axis("RMSE", results.force_unit(axis)))
+        panel.set(xlim=(-0.4, len(rungs) - 0.6), xlabel="version, and its error")
+        panel.set(title=axis, ylabel=style.label_axis("RMSE", results.force_unit(axis)))
     return style.finish(figure, "ladder", _describe_change(rungs, axes), panels[:1])
 
 

@@ -115,6 +115,5 @@ def _draw_loop(
         factor * line / stiffness, middle + line,
         color=style.VERMILLION, ls=(0, (4, 2)), lw=1.2, label="stiffness",
     )  # fmt: skip
-    panel.set_title(axis)
-    panel.set_xlabel(style.label_axis("deflection", unit))
+    panel.set(title=axis, xlabel=style.label_axis("deflection", unit))
     panel.set_ylabel(style.label_axis(results.name_force(axis), results.force_unit(axis)))

@@ -80,8 +80,7 @@ def _draw(results: Results, directions: Mapping[str, Damping], trace: pd.DataFra
             extent.append(np.array([command]))
         style.mark_trials(panel, trace)
         style.set_limits(panel, extent)
-        panel.set_title(name)
-        panel.set_xlabel("time in the filter (s)")
+        panel.set(title=name, xlabel="time in the filter (s)")
     panels[0].set_ylabel(style.label_axis("damping", "N.s/m"))
     caption = (
         f"Damping of the viscous field by the filter{results.cite_paper('Fig. 8')}, with 95 % "
