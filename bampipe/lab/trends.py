@@ -81,17 +81,11 @@ def _judge_session(row: TableRow, tables: Tables, charts: Sequence[ControlChart]
         for point in chart.points
         if chart.device == device and point.session == session and point.outside_limits
     }
-    moved = [
-        MovedParameter.of(
-            chart,
-            parameter=chart.name,
-            estimate=point.estimate,
-            percent=100.0 * (point.estimate - chart.centre) / abs(chart.centre)
-            if chart.centre
-            else None,
-        )
-        for chart, point in outside.items()
-    ]
+    moved = []
+    for chart, point in outside.items():
+        by, about = point.estimate - chart.centre, {"parameter": chart.name}
+        percent = 100.0 * by / abs(chart.centre) if chart.centre else None
+        moved.append(MovedParameter.of(chart, point, **about, percent=percent))
     judged = SessionVerdict(
         session=session,
         device=device,
@@ -128,7 +122,9 @@ def _explain_model(
         limits = "; no parameter is beyond its limits" if limited else ""
         return EFFECT, f"lacks {join_names(lacking)}{limits}", ""
     if not judged.diagnosed and judged.worst and judged.above_floor:
-        return UNKNOWN, phrases.describe_error(judged.worst), _diagnose_command(judged)
+        error = f"error on unseen trials {judged.worst[0]:.3g} times the floor on {judged.worst[1]}"
+        said = f"{error}: something is missing, and no diagnosis has been made"
+        return UNKNOWN, said, _diagnose_command(judged)
     if unjudged := _list_unjudged(judged, verdicts):
         return UNKNOWN, f"no verdict on {unjudged}", f"bampipe report {judged.session}"
     return IN_CONTROL, "", ""

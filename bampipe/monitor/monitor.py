@@ -93,30 +93,19 @@ class Monitor:
             return content
         model, n = self.start.model, len(self.system.coordinates)
         mean, sd = self._filter.mean, np.sqrt(np.diag(self._filter.covariance))
+        names = ("position", "position_sd", "velocity", "velocity_sd")
+        values = np.column_stack([mean[:n], sd[:n], mean[n : 2 * n], sd[n : 2 * n]]).tolist()
         content["state"] = {
-            axis: {
-                "position": float(mean[i]),
-                "position_sd": float(sd[i]),
-                "velocity": float(mean[n + i]),
-                "velocity_sd": float(sd[n + i]),
-            }
-            for i, axis in enumerate(self.system.coordinates)
+            axis: dict(zip(names, row, strict=True))
+            for axis, row in zip(self.system.coordinates, values, strict=True)
         }
-        theta, spread = mean[model.n_states :], sd[model.n_states :]
-        low, value, high = (
-            np.clip(
-                model.to_physical(theta + side * NORMAL_95 * spread)[0], model.lower, model.upper
-            )
-            for side in (-1.0, 0.0, 1.0)
-        )
+        theta, half = mean[model.n_states :], NORMAL_95 * sd[model.n_states :]
+        ends = (model.to_physical(at)[0] for at in (theta, theta - half, theta + half))
+        rows = np.column_stack([np.clip(end, model.lower, model.upper) for end in ends]).tolist()
+        free = [self.system.parameters[place] for place in model.free]
         content["parameters"] = {
-            self.system.parameters[place].name: {
-                "estimate": float(value[i]),
-                "lower": float(low[i]),
-                "upper": float(high[i]),
-                "unit": self.system.parameters[place].unit,
-            }
-            for i, place in enumerate(model.free)
+            one.name: {"estimate": value, "lower": low, "upper": high, "unit": one.unit}
+            for one, (value, low, high) in zip(free, rows, strict=True)
         }
         ratio, axes = self._test.ratio, self.system.coordinates
         content["nis"] = {

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from bampipe.report.wording import format_cell, format_prose
+from bampipe.report.wording import format_entry, format_prose
 
 Tone = Literal["good", "attention", "unknown", "note"]
 Span = tuple[Literal["plain", "strong", "code", "link"], str]
@@ -110,7 +110,7 @@ class Table:
     Attributes:
         caption: what it shows.
         columns: titles, units included, joined by `` | ``. ``>`` before a title stands for a
-            column of numbers; `` :p`` after it is the form of its cells (`wording.format_cell`),
+            column of numbers; `` :p`` after it is the form of its cells (`wording.format_entry`),
             ``~2`` the relative width of a column whose text wraps.
         rows: the cells, which are text once the table is made.
         note: a sentence below, or "".
@@ -123,7 +123,7 @@ class Table:
 
     def __post_init__(self) -> None:
         forms = [found[1] if (found := _FORM.search(c)) else "" for c in self.columns.split(" | ")]
-        rows = tuple(tuple(map(format_cell, row, forms)) for row in self.rows)
+        rows = tuple(tuple(map(format_entry, row, forms)) for row in self.rows)
         object.__setattr__(self, "rows", rows)
         object.__setattr__(self, "columns", _FORM.sub("", self.columns))
 

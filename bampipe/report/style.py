@@ -97,10 +97,7 @@ def split_figure(height: float) -> tuple[Figure, list[Axes]]:
 def finish(
     figure: Figure, name: str, caption: str, legend_from: Sequence[Axes] = ()
 ) -> document.Figure:
-    """Return the block of a figure, with a common legend of these panels below.
-
-    The same figure gives the same drawing.
-    """
+    """Return the block of a figure, with a common legend of these panels below."""
     found = [axes.get_legend_handles_labels() for axes in legend_from]
     names = [name for _, own in found for name in own]
     handles = [handle for own, _ in found for handle in own]
@@ -108,11 +105,16 @@ def finish(
         columns = int(figure.get_figwidth() / (_LETTER * max(map(len, names)) + _HANDLE))
         columns = max(1, min(_MOST_LEGEND_COLUMNS, columns, len(names)))
         figure.legend(handles, names, loc="outside lower center", ncols=columns)
+    return document.Figure(name.replace(":", "."), caption, render_svg(figure))
+
+
+def render_svg(figure: Figure) -> str:
+    """Return the figure as SVG: the same figure gives the same text."""
     _part_labels(figure)
     figure.set_layout_engine("none")  # already laid out, which takes half of the time
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return document.Figure(name.replace(":", "."), caption, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def _part_labels(figure: Figure) -> None:

@@ -134,7 +134,7 @@ _FORMS: dict[str, Callable[[Any], str]] = {
 """How the cells of a table are printed, by the form of their column."""
 
 
-def format_cell(value: Any, form: str = "") -> str:
+def format_entry(value: Any, form: str = "") -> str:
     """Return the cell of a table: a number, a value with its sd, whether something is so, or text.
 
     None is `NONE`, whatever the ``form``; text in a column of numbers is printed as it is.

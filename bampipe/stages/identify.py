@@ -291,18 +291,17 @@ def _find_timing(task: _Task, squares: SquaresFit, held: InputTiming | None) -> 
 
 def _describe_squares(task: _Task, squares: SquaresFit) -> list[str]:
     """Return notes on least squares: no replicates, or an axis that nothing drives."""
-    notes, system = [], task.system
-    if task.config.remove_bias and not squares.has_replicates:
-        notes.append(
-            "The model cannot be simulated on these trials, so all samples have equal weight and"
-            " the bias of filters was not removed."
-        )
-    if system.undriven:
-        notes.append(
-            f"No force acts on {', '.join(system.undriven)}: least squares underestimates the"
-            " terms of that equation, the more so the more the model lacks."
-        )
-    return notes
+    simulated = squares.has_replicates or not task.config.remove_bias
+    equal = (
+        "The model cannot be simulated on these trials, so all samples have equal weight and the"
+        " bias of filters was not removed."
+    )
+    undriven = task.system.undriven
+    small = (
+        f"No force acts on {', '.join(undriven)}: least squares underestimates the terms of that"
+        " equation, the more so the more the model lacks."
+    )
+    return [equal] * (not simulated) + [small] * bool(undriven)
 
 
 def _start(task: _Task) -> Array:

@@ -281,6 +281,7 @@ def _axis(
         for name, share in trial.calibration.items():
             shares[name] += weight * share
     calibration = stiffness * float(np.linalg.norm(list(shares.values())))
+    drifts = {trial.trial_id: _drift(trial) for trial in trials}
     for trial in trials:
         if not trial.found.yielded:
             notes.append(
@@ -288,8 +289,7 @@ def _axis(
                 f" {100.0 * trial.found.slope_change:.1f} % over their straight part, so the"
                 " stiffness is too high: load the axis further."
             )
-        drift = _drift(trial)
-        if abs(drift) > config.largest_drift:
+        if abs(drift := drifts[trial.trial_id]) > config.largest_drift:
             notes.append(
                 f"{trial.trial_id}: the loops drift by {100.0 * drift:.1f} % of their range, so"
                 " the brake slips."
@@ -333,9 +333,7 @@ def _axis(
             )
             for trial, cycle in cycles
         ),
-        trials={
-            trial.trial_id: LockedTrial.of(trial.found, drift=_drift(trial)) for trial in trials
-        },
+        trials={t.trial_id: LockedTrial.of(t.found, drift=drifts[t.trial_id]) for t in trials},
     )
 
 

@@ -185,12 +185,9 @@ def _silent_joints(
         if entry.fit_percent is None or entry.fit_percent >= SILENT_PERCENT:
             continue
         size = rms((c.measured for c in compared), (c.used for c in compared))[i]
-        buried = floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]
-        why = (
-            "noise and friction mask it"
-            if buried
-            else ("the model lacks the effect that dominates it")
-        )
+        why = "the model lacks the effect that dominates it"
+        if floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]:
+            why = "noise and friction mask it"
         share = max(entry.fit_percent, 0.0)
         found.append(
             f"{axis}: the model explains {share:.0f} % of its torque of {size:.2g} {entry.unit}"

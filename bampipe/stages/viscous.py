@@ -225,16 +225,13 @@ def _direction(
         return found()
     ratios = [abs(value - command) / sd if sd > 0.0 else np.inf for value in (estimate, felt)]
     p, felt_p = (float(2.0 * stats.t.sf(ratio, max(blocks - 1, 1))) for ratio in ratios)
-    what = (
-        f"differs from the commanded {command:.4g}"
-        if p < _SIGNIFICANT
-        else f"no significant difference from the commanded {command:.4g}"
-    )
+    differs = p < _SIGNIFICANT
+    what = "differs" if differs else "no significant difference"
     return found(
         commanded=command,
         p_value=p,
-        differs=p < _SIGNIFICANT,
+        differs=differs,
         felt_p_value=felt_p,
         felt_differs=felt_p < _SIGNIFICANT,
-        verdict=f"{what}, p = {p:.2g}",
+        verdict=f"{what} from the commanded {command:.4g}, p = {p:.2g}",
     )

@@ -134,7 +134,7 @@ def _tabulate_numbers(results: Results) -> Table | None:
     identified = identify.parameters if identify else {}
     validated = validate.axes if validate else {}
     stiff = stiffness.axes if stiffness else {}
-    columns = []
+    rows: dict[str, list[str]] = {}
     for axis in results.axes:
         error, locked = validated.get(axis), stiff.get(axis)
         fit = error.fit_percent if error else None
@@ -145,13 +145,14 @@ def _tabulate_numbers(results: Results) -> Table | None:
             "Noise floor": _format_error(error, "noise_floor"),
             "Error without friction terms": _format_error(error, "rmse_without_friction"),
             "Fit": NONE if fit is None else f"{format_decimals(fit, 1)} %",
-            "Stiffness, brake locked": format_scaled(locked.stiffness, locked.unit, sd=locked.sd)
-            if locked
-            else NONE,
+            "Stiffness, brake locked": NONE,
         }
-        columns.append(cells)
-    rows = [_share_unit(title, [cells[title] for cells in columns]) for title in columns[0]]
-    rows = [row for row in rows if any(cell != NONE for cell in row[1:])]
+        if locked:
+            shown = format_scaled(locked.stiffness, locked.unit, sd=locked.sd)
+            cells["Stiffness, brake locked"] = shown
+        for title, cell in cells.items():
+            rows.setdefault(title, []).append(cell)
+    rows = {title: cells for title, cells in rows.items() if {*cells} != {NONE}}
     if not rows:
         return None
     held_out = f"Held-out: {verdicts.describe_held_out(validate)}. {_TERMS}" if validate else ""
@@ -159,7 +160,7 @@ def _tabulate_numbers(results: Results) -> Table | None:
     return Table(
         "Key numbers (± one standard deviation)",
         " | ".join(("", *(f">{axis} ~1" for axis in results.axes))),
-        rows,
+        [_share_unit(*row) for row in rows.items()],
         " ".join(filter(None, notes)),
     )
 
