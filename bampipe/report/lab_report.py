@@ -1,6 +1,6 @@
 """The report over all sessions of a lab: verdicts, control charts, errors, trials."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 
@@ -42,20 +42,15 @@ def build_lab_report(folder: Path, pages: Mapping[str, str]) -> Report:
     with style.use_style():
         sections = [_summarise(trends, pages), *_show_charts(trends)]
         sections += [*_show_errors(folder, trends), *_show_trials(folder)]
-    moments = [one.recorded for one in trends.sessions if one.recorded]
-    document = Document("All sessions", _make_subtitle(trends, moments), tuple(sections))
-    stamps = (int(datetime.fromisoformat(moment).timestamp()) for moment in moments)
-    return Report.from_document(document, max(0, *stamps, 0))
-
-
-def _make_subtitle(trends: TrendsResult, moments: Sequence[str]) -> str:
     devices = sorted({one.device for one in trends.sessions})
     parts = [count_noun(len(trends.sessions), "session")]
-    parts.append(f"device{'s' if len(devices) > 1 else ''} {join_names(devices)}")
-    days = sorted({moment[:10] for moment in moments})
-    if days:
+    parts.append(f"device{'s' * (len(devices) > 1)} {join_names(devices)}")
+    moments = [one.recorded for one in trends.sessions if one.recorded]
+    if days := sorted({moment[:10] for moment in moments}):
         parts.append(days[0] if len(days) == 1 else f"recorded {days[0]} to {days[-1]}")
-    return ", ".join(parts)
+    document = Document("All sessions", ", ".join(parts), tuple(sections))
+    stamps = (int(datetime.fromisoformat(moment).timestamp()) for moment in moments)
+    return Report.from_document(document, max(0, *stamps, 0))
 
 
 def _summarise(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
@@ -109,7 +104,7 @@ def _show_charts(trends: TrendsResult) -> Iterator[Section]:
     devices = sorted({one.device for one in trends.series})
     for place, device in enumerate(devices, start=1):
         charts = [one for one in trends.series if one.device == device]
-        title = "Parameters over time" + (f", {device}" if len(devices) > 1 else "")
+        title = "Parameters over time" + f", {device}" * (len(devices) > 1)
         if all(len(chart.points) == 1 for chart in charts):
             name = charts[0].points[0].session
             text = f"This device has one session, {name}: there is nothing to compare."

@@ -64,10 +64,9 @@ def _list_estimates(results: Results, term: ModelTerm) -> str:
     identified = results.read(IdentifyResult)
     known = identified.parameters if identified else {}
     shown = []
-    for name in term.parameters:
-        if one := known.get(name):
-            value = f"{format_with_sd(one.estimate, one.sd)} {format_unit(one.unit)}".rstrip()
-            shown.append(f"{split_name(name.rpartition('.')[2])} {value}")
+    for name, one in ((name, known[name]) for name in term.parameters if name in known):
+        value = f"{format_with_sd(one.estimate, one.sd)} {format_unit(one.unit)}".rstrip()
+        shown.append(f"{split_name(name.rpartition('.')[2])} {value}")
     return f"Found: {'; '.join(shown)}." if shown else ""
 
 
@@ -105,19 +104,15 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator
     unit = format_unit(results.force_unit(found.window.axis))
     errors = _draw_window(top, bottom, found, unit)
     before, after = (format_digits(error, 2) for error in errors)
-    change = (
-        f"the residual falls from {before} to {after} {unit} (RMSE)"
-        if errors[1] < errors[0]
-        else f"the residual does not fall ({before} and {after} {unit} RMSE)"
-    )
+    change = f"the residual does not fall ({before} and {after} {unit} RMSE)"
+    if errors[1] < errors[0]:
+        change = f"the residual falls from {before} to {after} {unit} (RMSE)"
+    beside = f"Left: {_describe_curves(term, [first])} Right: the" if first else "The"
     caption = (
-        f"he worst window of {found.window.axis} without {found.added} ({found.window.doing}), "
-        f"where {change}."
+        f"{beside} worst window of {found.window.axis} without {found.added} "
+        f"({found.window.doing}), where {change}."
     )
-    beside = (
-        f"Left: {_describe_curves(term, [first])} Right: t{caption}" if first else f"T{caption}"
-    )
-    yield style.finish(figure, name, beside, [top])
+    yield style.finish(figure, name, caption, [top])
     others = [curve for curve in curves if curve is not first]
     yield from _draw_contribution(f"{name}-more", term, others)
 

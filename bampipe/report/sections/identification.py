@@ -115,19 +115,17 @@ def _qualify_intervals(results: Results) -> str:
         for error in (validated.axes.values() if validated else ())
         if error.noise_floor and error.standing == "above_floor"
     ]
-    if not lacking:
-        return ""
-    return (
-        ", as if the model lacked nothing; its held-out error is up to "
-        f"{format_digits(max(lacking))} times the noise floor, and the missing effect may bias the "
-        "estimates by more than these intervals"
+    most = format_digits(max(lacking, default=0.0))
+    said = (
+        f", as if the model lacked nothing; its held-out error is up to {most} times the noise"
+        " floor, and the missing effect may bias the estimates by more than these intervals"
     )
+    return said if lacking else ""
 
 
 def _select_parameters(identified: IdentifyResult) -> Mapping[str, ParameterEstimate]:
     """Return all but a robot's inertial numbers, of which motion determines only combinations."""
-    inertial, found = identified.inertial, identified.parameters
-    return {name: one for name, one in found.items() if name not in inertial}
+    return {n: one for n, one in identified.parameters.items() if n not in identified.inertial}
 
 
 def _tabulate_combinations(bases: Sequence[BaseEstimate]) -> Table:
@@ -165,13 +163,12 @@ def _list_checks(identified: IdentifyResult) -> str:
             "right."
         )
     lag, sd = 1e3 * timing.estimate, 1e3 * timing.sd  # ms; 0 where it was not estimated
-    if sd > 0.0 and abs(lag) < NORMAL_95 * sd:
+    verb = "lags" if lag > 0.0 else "leads"
+    text = f"The force {verb} the encoders by {format_with_sd(abs(lag), sd)} ms."
+    if abs(lag) < NORMAL_95 * sd:
         shown = f"(the force lags by {format_with_sd(lag, sd)} ms)"
-        parts.append(f"No delay between force and encoders is shown {shown}.")
-    elif sd > 0.0:
-        verb = "lags" if lag > 0.0 else "leads"
-        parts.append(f"The force {verb} the encoders by {format_with_sd(abs(lag), sd)} ms.")
-    return " ".join(parts)
+        text = f"No delay between force and encoders is shown {shown}."
+    return " ".join([*parts, *([text] if sd > 0.0 else [])])
 
 
 def _tabulate_states(results: Results, bounds: Mapping[str, StateBound]) -> Table:

@@ -5,6 +5,7 @@ the machine are in ``run.json``, and ``bampipe status`` prints them.
 """
 
 from collections.abc import Iterator, Mapping
+from itertools import groupby
 
 from bampipe.report.document import Block, Paragraph, Subheading, Table
 from bampipe.report.run_results import Results
@@ -34,11 +35,9 @@ def list_blocks(results: Results) -> Iterator[Block]:
 
 
 def _list_versions(stages: Mapping[str, StepRecord]) -> str:
-    found: dict[str, set[str]] = {}
-    for made in stages.values():
-        for name, version in made.versions.items():
-            found.setdefault(name, set()).add(version)
-    shown = ", ".join(f"{name} {' and '.join(sorted(found[name]))}" for name in sorted(found))
+    every = sorted({pair for made in stages.values() for pair in made.versions.items()})
+    names = groupby(every, key=lambda pair: pair[0])
+    shown = ", ".join(f"{n} {' and '.join(version for _, version in some)}" for n, some in names)
     text = f"Made with {shown}. " if shown else ""
     return f"{text}Full hashes are in `run.json`; equal inputs and versions give equal results."
 

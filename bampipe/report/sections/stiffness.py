@@ -18,9 +18,9 @@ TITLE = "Stiffness"
 def list_blocks(results: Results) -> Iterator[Block]:
     """Yield the stiffness of axes and gears; nothing for a session without locked trials."""
     found = results.read(StiffnessResult)
+    if found is None and (results.trials["kind"] == "locked").any():
+        yield results.state_undone("The locked trials have not been used", "stiffness")
     if found is None:
-        if (results.trials["kind"] == "locked").any():
-            yield results.state_undone("The locked trials have not been used", "stiffness")
         return
     axes, notes = found.axes, found.notes
     if not axes and not found.gears:

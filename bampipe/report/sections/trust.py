@@ -30,18 +30,15 @@ def list_blocks(results: Results) -> Iterator[Block]:
 
 
 def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
+    words = (
+        "No two parameters are confounded in these trials. The remaining limits follow from the "
+        "equations and from the numbers of the device file."
+    )
+    if identified.base_parameters:
+        words = "The motion of a robot determines only combinations of its inertial numbers"
+        words += " (under Identification)."
     if known.weak_directions:
         words = "Some parameters are known less well than their intervals suggest."
-    elif identified.base_parameters:
-        words = (
-            "The motion of a robot determines only combinations of its inertial numbers (under "
-            "Identification)."
-        )
-    else:
-        words = (
-            "No two parameters are confounded in these trials. The remaining limits follow from "
-            "the equations and from the numbers of the device file."
-        )
     if identified.inertial:
         words += (
             " A single inertial number depends on the drawing, however small its standard "

@@ -60,9 +60,8 @@ def _tabulate_axes(results: Results, validated: ValidateResult) -> Table:
         errors = (one.held_out_rmse, one.noise_floor, one.rmse, one.rmse_without_friction)
         rows.append((axis, *errors, fit, one.unit))
     bands = {axis: f"at {format_digits(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()}
-    each = join_names(f"{axis} {band}" for axis, band in bands.items())
-    if len(set(bands.values())) == 1:
-        each = next(iter(bands.values()))
+    different = {*bands.values()}
+    each = join_names(map(" ".join, bands.items())) if len(different) != 1 else different.pop()
     return Table(
         f"Error of the predicted force, model `{validated.model}`",
         "Axis | >Held-out RMSE ~1 | >Noise floor ~1 | >RMSE, all trials ~1"
