@@ -137,13 +137,11 @@ def _require_one_device(a: _Side, b: _Side) -> list[str]:
     """Refuse sessions that cannot be compared; return notes on the others."""
     if a.run.root.resolve() == b.run.root.resolve():
         raise InputError("both runs are the same", where=str(a.run.root))
-    facts = [_list_facts(side.system) for side in (a, b)]
-    for what, here in facts[0].items():
-        there = facts[1][what]
-        if here != there:
-            only_here, only_there = (
-                join_names(sorted(names)) or "none" for names in (here - there, there - here)
-            )
+    ours, theirs = (_list_facts(side.system) for side in (a, b))
+    for what, here in ours.items():
+        only = (here - theirs[what], theirs[what] - here)
+        if any(only):
+            only_here, only_there = (join_names(sorted(names)) or "none" for names in only)
             raise InputError(
                 f"the sessions differ in {what}: {only_here} only in {a.name},"
                 f" {only_there} only in {b.name}",

@@ -65,9 +65,7 @@ class RunState:
         return self.session
 
     def configure(self, step: Step, settings: Mapping[str, object]) -> Any:
-        where = self.request.pipeline.where
-        if step.stage in self.request.settings:
-            where = ""
+        where = self.request.pipeline.where * (step.stage not in self.request.settings)
         if step.stage in base.READS_SESSION:
             settings = {**settings, "session": str(self.session_folder().resolve())}
         fields = base.load_stage(step.stage).Config.__dataclass_fields__

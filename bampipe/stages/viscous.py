@@ -74,8 +74,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = trials[trials["trial_id"].astype(str).isin(moving)]
     target = f"models/{config.model}/viscous"
     if trials.empty:
-        kinds = {"t_total": "float64", "trial_id": "str"}
-        rows = pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in kinds.items()})
+        rows = pd.DataFrame(columns=["t_total", "trial_id"])
+        rows = rows.astype({"t_total": "float64", "trial_id": "str"})
         write_parquet(out / f"{target}.parquet", rows)
         headline = "No trials in a viscous field in this session."
         empty = ViscousResult(model=config.model, directions={}, trials=(), headline=headline)
