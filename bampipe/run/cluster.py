@@ -42,15 +42,12 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
     Raises:
         InputError: Dask is not installed, the scheduler does not answer, or has no workers.
     """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise InputError(
-            "--engine dask needs Dask", remedy="pip install 'bampipe[dask]'"
-        ) from error
+    from bampipe.data.readers.trial import need
+
+    distributed = need("distributed", "dask")
     # Lost connections are reported once, below, not by Dask's log.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    client = _connect(scheduler) if scheduler else Client(threads_per_worker=1)
+    client = _connect(scheduler) if scheduler else distributed.Client(threads_per_worker=1)
     outcomes: dict[int, Outcome] = {}
     lost = ""
     try:
