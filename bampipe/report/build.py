@@ -34,12 +34,8 @@ class Report:
     @classmethod
     def from_document(cls, document: Document, recorded: int, explorer: str = "") -> Report:
         """Return the files of ``document``; see `typeset.render_pdf` for ``recorded``."""
-        figures = {
-            block.name: block.svg
-            for section in document.sections
-            for block in section.blocks
-            if isinstance(block, Figure)
-        }
+        blocks = (block for section in document.sections for block in section.blocks)
+        figures = {block.name: block.svg for block in blocks if isinstance(block, Figure)}
         titles = tuple(section.title for section in document.sections)
         html = page.render_page(document, "explore.html" if explorer else "")
         return cls(typeset.render_pdf(document, recorded), html, explorer, figures, titles)

@@ -41,25 +41,20 @@ _MOST_MAPS = 6
 
 def list_blocks(results: Results) -> Iterator[Block]:
     """Yield the findings of each diagnosis."""
-    found = [
-        (model, content)
-        for model in results.models
-        if (content := results.read(DiagnoseResult, model)) is not None
-    ]
+    every = (results.read(DiagnoseResult, model) for model in results.models)
+    found = [content for content in every if content is not None]
     if not found:
         yield Paragraph(f"No model has been diagnosed yet: run `{results.diagnose_command}`.")
-        return
-    last, after = found[-1]
-    for model, content in found:
+    for content in found:
         if len(found) > 1:
-            yield Subheading(f"Model `{model}`")
-        yield from _show_model(results, model, content, {} if model == last else after.maps)
+            yield Subheading(f"Model `{content.model}`")
+        yield from _show_model(results, content, {} if content is found[-1] else found[-1].maps)
 
 
 def _show_model(
-    results: Results, model: str, found: DiagnoseResult, later: Mapping[str, Maps]
+    results: Results, found: DiagnoseResult, later: Mapping[str, Maps]
 ) -> Iterator[Block]:
-    axes = results.order_axes(found.axes)
+    model, axes = found.model, results.order_axes(found.axes)
     yield Bullets(tuple(entry.sentence for entry in axes.values()))
     yield _tabulate_verdicts(found, axes)
     if limits := phrases.limits(found):
@@ -68,7 +63,7 @@ def _show_model(
     if found.ranking and lacking:
         yield _tabulate_ranking(found.ranking)
         yield from _tabulate_sets(found)
-    yield _advise(results, model, found) if lacking else _tell_sensitivity(results, model)
+    yield _advise(results, found) if lacking else _tell_sensitivity(results, model)
     if found.suggested_trial is not None:
         yield Callout("note", "A trial that would tell more", found.suggested_trial.sentence)
     for axis in lacking:
@@ -90,14 +85,13 @@ def _tell_sensitivity(results: Results, model: str) -> Paragraph:
     )
 
 
-def _advise(results: Results, model: str, found: DiagnoseResult) -> Paragraph:
+def _advise(results: Results, found: DiagnoseResult) -> Paragraph:
     """Return the next command, or its result if it has been run."""
-    compared = results.read(CompareResult)
-    wanted = set(found.selected)
+    compared, wanted = results.read(CompareResult), {*found.selected}
     for rung in compared.ladder if compared else ():
-        if wanted and rung.parent == model and wanted == set((rung.added or "").split(", ")):
+        if wanted and rung.parent == found.model and wanted == {*(rung.added or "").split(", ")}:
             return Paragraph(f"Added since, as model `{rung.model}`.")
-    if found.next.startswith("bampipe draft ") and results.read(DraftResult, model):
+    if found.next.startswith("bampipe draft ") and results.read(DraftResult, found.model):
         return Paragraph("Drafted since (under Drafts).")
     return results.state_next(found.next)
 

@@ -166,11 +166,11 @@ def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
         before, after = (rung.held_out_rmse.get(axis) for rung in (rungs[0], rungs[-1]))
         if before and after:
             change = 100.0 * (after / before - 1.0)
-            verb = "falls" if change <= -1.0 else "rises" if change >= 1.0 else ""
             # A fall by 100 % would leave nothing.
             decimals = max(0, int(np.ceil(-np.log10(100.0 * after / before))))
-            size = format_decimals(abs(change), decimals)
-            parts.append(f"{axis} {verb} by {size} %" if verb else f"{axis} does not change")
+            size = f"{format_decimals(abs(change), decimals)} %"
+            verb = f"{'falls' if change < 0.0 else 'rises'} by {size}"
+            parts.append(f"{axis} {verb if abs(change) >= 1.0 else 'does not change'}")
     changes = f": {join_names(parts)}" if parts else ""
     return f"Error on held-out trials by version, against the noise floor{changes}."
 

@@ -20,16 +20,18 @@ def list_blocks(results: Results) -> Iterator[Block]:
         return
     yield Callout("note", "The next trial", found.sentence)
     yield Paragraph(f"{found.why} {found.expected}")
-    if identified := results.read(IdentifyResult):
-        forecasts = read_forecasts(results.root, results.model)
+    forecasts, identified = (
+        read_forecasts(results.root, results.model),
+        results.read(IdentifyResult),
+    )
+    if identified is not None:
         lines = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
         if lines:
             yield Bullets(tuple(one.replace("RUN", results.root.name) for one in lines))
     best = found.proposals[0]
     if best.confusion:
-        title = "Probability of confusing two effects"
         heads = ("with the present trials", "with the next one")
-        yield tabulate_confusion(title, heads, best.confusion)
+        yield tabulate_confusion("Probability of confusing two effects", heads, best.confusion)
     if best.sd:
         title = "Standard deviation of each parameter, now and with the next trial"
         yield tabulate_sds(title, best.sd)
@@ -64,11 +66,11 @@ def tabulate_sds(title: str, entries: Mapping[str, ExpectedSd]) -> Table:
 
 
 def _tabulate_sensitivity(table: Mapping[str, Detectable]) -> Table:
-    def factor(one: Detectable) -> float:
-        return float("inf") if one.smallest is None else one.smallest / one.typical
+    def factor(pair: tuple[str, Detectable]) -> float:
+        return float("inf") if pair[1].smallest is None else pair[1].smallest / pair[1].typical
 
     rows = []
-    for name, one in sorted(table.items(), key=lambda pair: -factor(pair[1])):
+    for name, one in sorted(table.items(), key=factor, reverse=True):
         sizes = (one.smallest, one.with_proposal, one.typical)
         strength = one.parameter.rpartition(".")[2]
         rows.append((name, one.axis or None, strength, *sizes, one.unit or "1"))

@@ -96,13 +96,11 @@ def _describe_ladder(results: Results) -> str:
         return ""
     first = compared.ladder[0]
     number = [rung.model for rung in compared.ladder].index(results.model)
-    last = compared.ladder[number]
-    if last is first:
-        return _explain_rejection(results, compared)
-    changes = []
+    if number == 0:
+        return _explain_rejection(compared)
+    last, changes = compared.ladder[number], []
     for axis, before in results.order_axes(first.held_out_rmse).items():
-        after = last.held_out_rmse.get(axis)
-        floor = last.noise_floor.get(axis)
+        after, floor = last.held_out_rmse.get(axis), last.noise_floor.get(axis)
         if after is not None:
             unit = format_unit(results.force_unit(axis))
             text = f"{axis} {format_digits(before)} to {format_digits(after)} {unit}"
@@ -113,7 +111,7 @@ def _describe_ladder(results: Results) -> str:
     )
 
 
-def _explain_rejection(results: Results, compared: CompareResult) -> str:
+def _explain_rejection(compared: CompareResult) -> str:
     """Say why no later version is accepted, although one may have a lower error."""
     first = compared.ladder[0]
     better = [rung for rung in compared.ladder if rung.has_lower_error_than(first)]
@@ -203,5 +201,5 @@ def _list_others(results: Results, parameters: Mapping[str, ParameterEstimate]) 
     others = [name for name in named if not name.startswith(_FRICTION)]
     if len(others) > _MOST_OTHERS:  # a robot's bodies
         return f"{count_noun(len(others), 'other parameter')} under Identification."
-    shown = [f"{name_parameter(name)}: {_format_estimate(parameters[name])}" for name in others]
-    return "; ".join(shown) + "." if shown else ""
+    shown = (f"{name_parameter(name)}: {_format_estimate(parameters[name])}" for name in others)
+    return "; ".join(shown) + "." * bool(others)
