@@ -173,13 +173,10 @@ def _compare_parameters(
 ) -> tuple[dict[str, ParameterChange], dict[str, list[str]]]:
     """Return the changes of common parameters, and the other parameters of each session."""
     tables: list[dict[str, ParameterEstimate | BaseEstimate]] = []
-    for side in (a, b):
-        every, inertial = side.found.parameters, side.found.inertial
-        bases = side.found.base_parameters or ()
-        tables.append(
-            {name: entry for name, entry in every.items() if name not in inertial}
-            | {base.combination: base for base in bases if base.shown}
-        )
+    for found in (a.found, b.found):
+        own = {n: entry for n, entry in found.parameters.items() if n not in found.inertial}
+        shown = {base.combination: base for base in found.base_parameters or () if base.shown}
+        tables.append({**own, **shown})
     common = [name for name in tables[0] if name in tables[1]]
     pairs = {name: (tables[0][name], tables[1][name]) for name in common}
     z = []
