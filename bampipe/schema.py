@@ -197,6 +197,9 @@ def json_schema(kind: type) -> dict[str, Any]:
     content = TypeAdapter(kind).json_schema(schema_generator=_Generator)
     for definition in (content, *content.get("$defs", {}).values()):
         del definition["title"]
+        for entry in definition.get("properties", {}).values():
+            if "description" in entry:  # a docstring may have several lines
+                entry["description"] = " ".join(entry["description"].split())
     name = content["properties"].get("schema", {}).get("const")
     head = {"$schema": GenerateJsonSchema.schema_dialect} | ({"$id": name} if name else {})
     return head | content

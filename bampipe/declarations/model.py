@@ -19,11 +19,9 @@ class ModelFile(Declaration):
     parent: str = Field(default="", description="Name of the parent; empty for the base model")
     device: Text = Field(description="Name of the device")
     effects: Several[Text] = Field(default=(), description="Effects, name[:target]")
-    start: dict[str, float] = Field(
-        default={},
-        description="Initial values for identification, by parameter of an effect; those not given"
-        " are searched for",
-    )
+    start: dict[str, float] = Field(default={})
+    """Initial values for identification, by parameter of an effect; those not given are searched
+    for"""
 
     def text(self) -> str:
         """Return the model as TOML."""

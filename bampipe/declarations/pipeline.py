@@ -49,11 +49,9 @@ class Gate(Declaration):
     divide_by: NumberPath = Field(
         default="", description="a dotted path of a number by which the value is divided"
     )
-    against: Literal["", "accepted"] = Field(
-        default="",
-        description="Judge the change from the accepted values instead, in percent; a change beyond"
-        " the limit, but within two standard deviations, only warns",
-    )
+    against: Literal["", "accepted"] = ""
+    """Judge the change from the accepted values instead, in percent; a change beyond the limit, but
+    within two standard deviations, only warns"""
     judged_by: NumberPath = Field(
         default="", description="a dotted path of a word that says whether the value passes"
     )

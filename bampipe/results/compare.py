@@ -27,10 +27,9 @@ class Rung(Record):
     held_out_rmse: dict[str, Size]
     noise_floor: dict[str, Size | None] = Field(description="null if none was computed")
     standing: dict[str, FloorStatus]
-    confirmed: bool = Field(
-        description="A model without a parent, or one with a confirmed parent and a lower"
-        " held-out error than that; not a model without a noise floor if its parent has one"
-    )
+    confirmed: bool
+    """A model without a parent, or one with a confirmed parent and a lower held-out error than
+    that; not a model without a noise floor if its parent has one"""
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
     free_run_reason: str = ""

@@ -33,10 +33,9 @@ class AxisVerdict(Record):
     force_rms: Size = Field(description="Root mean square of the applied force")
     explained: UpToOne
     """Share of the mean square of the applied force that the final model explains"""
-    explainable_share: UpToOne = Field(
-        description="Share of the residual, in the mean square, that a smooth function of position,"
-        " speed, load and time since reversal predicts on unseen trials"
-    )
+    explainable_share: UpToOne
+    """Share of the residual, in the mean square, that a smooth function of position, speed, load
+    and time since reversal predicts on unseen trials"""
     explainable_after: UpToOne = Field(description="The same of the final model")
     explained_by_effects: UpToOne
     """Share of the excess mean square that the most probable set removes"""
@@ -55,11 +54,10 @@ class RankedEffect(Record):
     effect: str
     axis: str
     held_out_rmse_before: Size = Field(description="Of the model diagnosed")
-    held_out_rmse_after: Size = Field(
-        description="For an effect of the most probable set, error without and with it beside the"
-        " others; otherwise of the diagnosed model with it alone, as if both sides of the"
-        " equation kept their size"
-    )
+    held_out_rmse_after: Size
+    """For an effect of the most probable set, error without and with it beside the others;
+    otherwise of the diagnosed model with it alone, as if both sides of the equation kept their
+    size"""
     unit: str
     probability: Share
     p_value: Share = Field(description="Probability that replicates give any candidate such a gain")

@@ -63,8 +63,6 @@ class FilterResult(Result, file="filter/filter.json", stage="filter"):
     skipped: dict[str, str] = Field(description="By trial: reason why it was skipped")
     disturbances: dict[str, tuple[Disturbance, ...]] = Field(default_factory=dict)
     """By trial: excluded stretches"""
-    force_offsets: dict[str, dict[str, float]] = Field(
-        default_factory=dict,
-        description="By trial and force, N, N.m or A: offset from the mean of the trials, for a"
-        " sensor that was zeroed anew in each; it has been subtracted",
-    )
+    force_offsets: dict[str, dict[str, float]] = Field(default_factory=dict)
+    """By trial and force, N, N.m or A: offset from the mean of the trials, for a sensor that was
+    zeroed anew in each; it has been subtracted"""

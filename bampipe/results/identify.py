@@ -20,16 +20,12 @@ class ParameterEstimate(Record):
     at_bound: bool = Field(description="Within one sd of its physical bound")
     filter_sd: Size | None = None
     """Standard deviation of the filter alone, valid for white noise only"""
-    smoothing_sd: Size | None = Field(
-        default=None,
-        description="Part of sd due to the smoothed sign of a velocity; 0 if the machine creeps"
-        " as the model does, null if the method excludes standstill",
-    )
-    calibration_sd: Size | None = Field(
-        default=None,
-        description="Part of sd from the stated uncertainty of sensors and constants, and from"
-        " encoder zeros that are known to one step; null without any",
-    )
+    smoothing_sd: Size | None = None
+    """Part of sd due to the smoothed sign of a velocity; 0 if the machine creeps as the model does,
+    null if the method excludes standstill"""
+    calibration_sd: Size | None = None
+    """Part of sd from the stated uncertainty of sensors and constants, and from encoder zeros that
+    are known to one step; null without any"""
     statistical_sd: Size | None = None
     """The rest of sd; null if all of it is statistical"""
     least_squares_bias: float | None = None
@@ -77,11 +73,10 @@ class WorstSecond(Record):
 class Influence(Record):
     """Influence of parts of the data on the parameters."""
 
-    trials: dict[str, dict[str, float]] = Field(
-        description="By trial, or block of a single one, then by parameter and `input_timing`:"
-        " change of the least-squares estimate without it, in published standard deviations."
-        " More than ten trials form ten groups"
-    )
+    trials: dict[str, dict[str, float]]
+    """By trial, or block of a single one, then by parameter and `input_timing`: change of the
+    least-squares estimate without it, in published standard deviations. More than ten trials form
+    ten groups"""
     worst_second: WorstSecond
 
 
@@ -106,12 +101,10 @@ class InputTiming(Record):
     unit: Literal["s"]
     limit: Size = 0.0
     """Largest value, half a sample; 0 if it was not estimated"""
-    of_residual: float = Field(
-        default=0.0,
-        description="Timing with the least residual within the limit, s, including the bias of"
-        " filters at reversals; for a robot the one on which most drives agree away from"
-        " reversals; 0 if the trials show none. Residuals are compared at this timing",
-    )
+    of_residual: float = 0.0
+    """Timing with the least residual within the limit, s, including the bias of filters at
+    reversals; for a robot the one on which most drives agree away from reversals; 0 if the trials
+    show none. Residuals are compared at this timing"""
 
     @property
     def is_at_limit(self) -> bool:
@@ -175,11 +168,9 @@ class Convergence(Record):
 
     converged: bool
     iterations: Count | None = Field(default=None, description="Of least squares")
-    settled_s: dict[str, Size] | None = Field(
-        default=None,
-        description="Time after which each estimate stays within 2 % or 3 sd of its final value, "
-        "s from the start of the first run",
-    )
+    settled_s: dict[str, Size] | None = None
+    """Time after which each estimate stays within 2 % or 3 sd of its final value, s from the start
+    of the first run"""
     total_s: Size | None = Field(default=None, description="Of the first run and the last")
 
 
@@ -262,11 +253,9 @@ class IdentifyResult(Result, file="models/{model}/identify.json", stage="identif
     trials: Names = Field(description="Free trials used")
     parameters: dict[str, ParameterEstimate]
     """By name: viscous.<axis>, coulomb.<axis>, mass, <effect>[.<axis>].<parameter>"""
-    effects: dict[str, EffectEstimate] = Field(
-        default={},
-        description="By effect of the model. An effect does not count as identified if its"
-        " strength or shape is at a bound or has an interval larger than itself",
-    )
+    effects: dict[str, EffectEstimate] = Field(default={})
+    """By effect of the model. An effect does not count as identified if its strength or shape is at
+    a bound or has an interval larger than itself"""
     influence: Influence
     covariance: Covariance
     input_timing: InputTiming
@@ -305,8 +294,6 @@ class IdentifyResult(Result, file="models/{model}/identify.json", stage="identif
         """Inertial numbers of a robot's bodies: motion determines only combinations of them."""
         return frozenset(name for base in self.base_parameters or () for name in base.members)
 
-    repeats: Count | None = Field(
-        default=None,
-        description="Further runs of the filter around its answer; the states are of the last "
-        "run, the trace of the first and the last",
-    )
+    repeats: Count | None = None
+    """Further runs of the filter around its answer; the states are of the last run, the trace of
+    the first and the last"""

@@ -96,10 +96,9 @@ class IngestResult(Result, file="ingest/session.json", stage="ingest"):
     kept_every: int = Field(default=1, ge=1, description="One sample of a log in this many is kept")
     axes: dict[str, EncoderChannel] = Field(min_length=1)
     force: ForceChannels
-    sensor_warnings: Names = Field(
-        description="Stated noise or resolution that differs from the measured one by more than a"
-        " factor of two; readings that look like counts"
-    )
+    sensor_warnings: Names
+    """Stated noise or resolution that differs from the measured one by more than a factor of two;
+    readings that look like counts"""
     mains_hum: tuple[MainsHum, ...] = ()
     brakes: dict[str, RecordedChannel]
     channels: dict[str, RecordedChannel]

@@ -41,10 +41,9 @@ class AxisSetup(Record):
     """The state of the set-up of one axis."""
 
     state: AxisState
-    error_percent: Size | None = Field(
-        description="Error of the bare device fitted by least squares, per cent of the applied"
-        " force; null without applied force, or if the axis hardly moves"
-    )
+    error_percent: Size | None
+    """Error of the bare device fitted by least squares, per cent of the applied force; null without
+    applied force, or if the axis hardly moves"""
     moving_share: Share = Field(description="Share of the samples in which the axis moves")
 
 

@@ -84,10 +84,9 @@ class GearStiffness(Record):
     side: Literal["motor", "load"] = Field(description="Side of the second encoder")
     late_s: float = Field(description="Delay of the second encoder's reading after the first, s")
     late_sd: Size
-    explained: float = Field(
-        description="Share of the variance of the difference that stiffness and play explain, after"
-        " timing and the drive's own losses"
-    )
+    explained: float
+    """Share of the variance of the difference that stiffness and play explain, after timing and the
+    drive's own losses"""
     channel: str = Field(description="Of the second encoder")
 
 

@@ -28,10 +28,9 @@ class AxisError(Record):
 class JudgedError(AxisError):
     """Error of one axis over all trials, compared with its noise floor."""
 
-    noise_floor: Size | None = Field(
-        description="Error of the fitted model's own replicates with the same sensors and"
-        " filters; null if none was computed"
-    )
+    noise_floor: Size | None
+    """Error of the fitted model's own replicates with the same sensors and filters; null if none
+    was computed"""
     noise_floor_sd: Size = Field(description="Scatter of one replicate")
     standing: FloorStatus
 
