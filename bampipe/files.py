@@ -62,8 +62,8 @@ def read_json_table(path: Path) -> dict[str, Any]:
             return content
         raise InputError("not a table", where=str(path))
     except InputError as error:
-        remedy = "make it again (--force)"
-        raise InputError(error.what, where=error.where, remedy=remedy) from error
+        error.remedy = "make it again (--force)"
+        raise
 
 
 def parse_json(data: bytes, where: str) -> Any:

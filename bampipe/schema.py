@@ -37,7 +37,9 @@ class Declaration(BaseModel):
     Faults between fields are found by `cross_faults` once every field is valid by itself.
     """
 
-    model_config = ConfigDict(**STRICT, frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        **STRICT, frozen=True, arbitrary_types_allowed=True, use_attribute_docstrings=True
+    )
 
     def cross_faults(self) -> Iterator[InputError]:
         """Yield every fault between the fields; ``where`` is a key below this table, or empty."""
@@ -195,6 +197,9 @@ def json_schema(kind: type) -> dict[str, Any]:
     content = TypeAdapter(kind).json_schema(schema_generator=_Generator)
     for definition in (content, *content.get("$defs", {}).values()):
         del definition["title"]
+        for entry in definition.get("properties", {}).values():
+            if "description" in entry:  # a docstring may have several lines
+                entry["description"] = " ".join(entry["description"].split())
     name = content["properties"].get("schema", {}).get("const")
     head = {"$schema": GenerateJsonSchema.schema_dialect} | ({"$id": name} if name else {})
     return head | content

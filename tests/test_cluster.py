@@ -20,7 +20,7 @@ from conftest import TOYS, Toy, contents
 from bampipe.errors import InputError
 from bampipe.run import cluster as engine
 from bampipe.run import pipeline as pipelines
-from bampipe.run.cluster import _placed, run_on_cluster
+from bampipe.run.cluster import _place, run_on_cluster
 from bampipe.run.events import Event, ignore_event
 from bampipe.run.request import Request, Step
 from bampipe.run.runner import run_session
@@ -107,8 +107,8 @@ def test_a_stage_on_a_worker_starts_no_processes(tmp_path: Path) -> None:
         accepted=Path("accepted"),
     )
     step = Step("diagnose", "base")
-    assert _placed(request).accepted == Path.cwd() / "accepted"
-    state = RunState(_placed(replace(request, processes=2)))
+    assert _place(request).accepted == Path.cwd() / "accepted"
+    state = RunState(_place(replace(request, processes=2)))
     assert state.configure(step, state.settings(step)).jobs == 1
 
 

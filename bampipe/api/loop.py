@@ -37,6 +37,13 @@ class LoopOptions:
         """Return a lock on the run folder; do not hold it during :meth:`run`."""
         return record.lock(self.request.root, self.request.wait, self.listen)
 
+    def remove(self, model: str) -> None:
+        """Remove a model."""
+        folder = self.request.root / "models" / model
+        if folder.exists():
+            with self.lock():
+                shutil.rmtree(folder)
+
     def run(
         self,
         first: str,
@@ -143,18 +150,10 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
         options.run("identify", "validate", child)
     except BaseException:
         if f"identify:{child}" not in record.read(root).stages:
-            _remove(options, child)
+            options.remove(child)
         raise
     options.run("compare", "compare", "")
     return child
-
-
-def _remove(options: LoopOptions, model: str) -> None:
-    """Remove a model."""
-    folder = options.request.root / "models" / model
-    if folder.exists():
-        with options.lock():
-            shutil.rmtree(folder)
 
 
 def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> None:
@@ -257,7 +256,7 @@ def _add(
     if weak := [name for name in effects if not found[name].has_strength]:
         tell(f"{', '.join(weak)}: strength not significantly different from zero, removed")
         effects = tuple(effect for effect in effects if effect not in weak)
-        _remove(options, child)
+        options.remove(child)
         if not effects:
             return ""
         child = extend(options, model, effects)

@@ -194,7 +194,7 @@ def open_run(path: str | Path) -> Run:
     Raises:
         InputError: there is no such run.
     """
-    for candidate in (Path(path), Path("runs") / path):
-        if (candidate / record.FILE).is_file():
-            return Run(candidate)
-    return Run(path)
+    known = (
+        place for place in (Path(path), Path("runs") / path) if (place / record.FILE).is_file()
+    )
+    return Run(next(known, path))

@@ -137,13 +137,11 @@ def _require_one_device(a: _Side, b: _Side) -> list[str]:
     """Refuse sessions that cannot be compared; return notes on the others."""
     if a.run.root.resolve() == b.run.root.resolve():
         raise InputError("both runs are the same", where=str(a.run.root))
-    facts = [_list_facts(side.system) for side in (a, b)]
-    for what, here in facts[0].items():
-        there = facts[1][what]
-        if here != there:
-            only_here, only_there = (
-                join_names(sorted(names)) or "none" for names in (here - there, there - here)
-            )
+    ours, theirs = (_list_facts(side.system) for side in (a, b))
+    for what, here in ours.items():
+        only = (here - theirs[what], theirs[what] - here)
+        if any(only):
+            only_here, only_there = (join_names(sorted(names)) or "none" for names in only)
             raise InputError(
                 f"the sessions differ in {what}: {only_here} only in {a.name},"
                 f" {only_there} only in {b.name}",
@@ -175,13 +173,10 @@ def _compare_parameters(
 ) -> tuple[dict[str, ParameterChange], dict[str, list[str]]]:
     """Return the changes of common parameters, and the other parameters of each session."""
     tables: list[dict[str, ParameterEstimate | BaseEstimate]] = []
-    for side in (a, b):
-        every, inertial = side.found.parameters, side.found.inertial
-        bases = side.found.base_parameters or ()
-        tables.append(
-            {name: entry for name, entry in every.items() if name not in inertial}
-            | {base.combination: base for base in bases if base.shown}
-        )
+    for found in (a.found, b.found):
+        own = {n: entry for n, entry in found.parameters.items() if n not in found.inertial}
+        shown = {base.combination: base for base in found.base_parameters or () if base.shown}
+        tables.append({**own, **shown})
     common = [name for name in tables[0] if name in tables[1]]
     pairs = {name: (tables[0][name], tables[1][name]) for name in common}
     z = []

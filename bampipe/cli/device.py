@@ -31,11 +31,14 @@ def list_(json: JsonOption = False) -> None:
     from bampipe.physics import registry
 
     found = [registry.device(name) for name in registry.device_names()]
-    rows = [(d.name, [c.name for c in d.coordinates], d.summary) for d in found]
+    rows = [
+        {"name": d.name, "axes": [c.name for c in d.coordinates], "summary": d.summary}
+        for d in found
+    ]
     if json:
-        show.print_json([dict(zip(("name", "axes", "summary"), row, strict=True)) for row in rows])
+        show.print_json(rows)
         return
-    show.print_table(["device", "axes", "summary"], rows)
+    show.print_table(["device", "axes", "summary"], [[*row.values()] for row in rows])
     show.say("\none in full: bampipe device show NAME")
 
 

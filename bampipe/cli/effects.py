@@ -112,11 +112,11 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     found = signature(device, effect, chosen)
     if json:
         shown = {"declaration": dict(effect.declaration), "targets": [t for t in targets if t]}
-        about: dict[str, object] | None = None
-        if found is not None:
-            kept = ("axis", "unit", "against", "share")
-            about = {"target": chosen, "rms": dict(found.rms)}
-            about |= {name: getattr(found, name) for name in kept}
+        about = found and {
+            **{name: getattr(found, name) for name in ("axis", "unit", "against", "share")},
+            "target": chosen,
+            "rms": dict(found.rms),
+        }
         show.print_json({**shown, "signature": about})
         return
     show.say(f"{effect.name}: {effect.summary}\n")
@@ -127,13 +127,13 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     head = ["parameter", "axis", "unit", "prior", "sd", "lower", "upper", "typical", ""]
     used = [k for k in range(len(head)) if k < 1 or any(row[k] not in (None, "") for row in rows)]
     show.print_table([head[k] for k in used], [[row[k] for k in used] for row in rows])
-    names = [f"{effect.name}:{item}" if item else effect.name for item in targets]
-    show.say(f"\non {device_name}: {', '.join(names)}")
+    names = {item: f"{effect.name}:{item}".removesuffix(":") for item in targets}
+    show.say(f"\non {device_name}: {', '.join(names.values())}")
     show.say(f"looks like: {effect.looks_like}")
     if effect.on_the_machine:
         show.say(f"on the machine: {effect.on_the_machine}")
     show.say(f"source: {effect.source}\n")
-    title = f"{effect.name}:{chosen}" if chosen else effect.name
+    title = names[chosen]
     if found is None:
         show.say(f"{title} leaves nothing in the residual of a free or braked motion")
         return

@@ -186,11 +186,10 @@ def _tell_consistency(content: Mapping[str, Any]) -> Any:
 
     nis = content.get("nis", BLANK)
     ratio = nis.get("window")
-    if content["alarm"] and ratio is None:
-        axes = ", ".join(nis.get("useless", ()))
-        return Text(f"ALARM: no usable data {axes}".strip(), style="bold red")
     if content["alarm"]:
-        return Text(f"ALARM: {nis['worst']} is not explained ({ratio:.2f})", style="bold red")
+        said = f"no usable data {', '.join(nis.get('useless', ()))}".strip()
+        said = said if ratio is None else f"{nis['worst']} is not explained ({ratio:.2f})"
+        return Text(f"ALARM: {said}", style="bold red")
     if ratio is None:
         return Text("waiting for a complete window")
     return Text(f"consistent ({ratio:.2f}, alarm from {nis['threshold']:.2f})", style="green")

@@ -42,15 +42,14 @@ def init(
     """
     from bampipe.setup.proposal import propose, write_proposal
 
-    proposal = propose(
-        folder, device, [name for name in names.split(",") if name.strip()], episodes
-    )
+    columns = [name for name in names.split(",") if name.strip()]
+    proposal = propose(folder, device, columns, episodes)
     written = [] if dry else write_proposal(folder, proposal)
     if json:
-        names_kept = ("session", "device", "fill_in", "check")
-        content = {name: getattr(proposal, name) for name in names_kept}
-        written_names = [str(path) for path in written]
-        show.print_json({**content, "written": written_names, "left_out": proposal.passed})
+        kept = ("session", "device", "fill_in", "check")
+        content = {name: getattr(proposal, name) for name in kept}
+        files = [str(path) for path in written]
+        show.print_json({**content, "written": files, "left_out": proposal.passed})
         return
     if dry:
         show.say("\n\n".join(filter(None, (proposal.session.rstrip(), proposal.device.rstrip()))))

@@ -20,9 +20,8 @@ def after_run(root: Path, model: str) -> str:
     if setup is not None and setup.mistakes:
         return "correct the session file as the first line says, and run it again"
     identified = run.find(IdentifyResult, model)
-    fitted, diagnosed = (set(one.trials) if one else set() for one in (identified, found))
-    has_new_trials = bool(diagnosed and fitted - diagnosed)
-    if has_new_trials or (found is None and _is_above_floor(run, model)):
+    fitted, diagnosed = ({*one.trials} if one else set() for one in (identified, found))
+    if (diagnosed and fitted - diagnosed) or (found is None and _is_above_floor(run, model)):
         return f"bampipe diagnose RUN{run.model_option(model)}"
     if found is not None and found.lacking:
         return _after_diagnosis(run, model, found.next)

@@ -7,6 +7,8 @@ from pathlib import Path
 from bampipe.errors import InputError, choose_from
 from bampipe.run.session_name import session_folder, session_id
 
+_FIRST = "start with `bampipe run SESSION`"
+
 
 def run_folder_of(argument: str, runs: Path) -> Path | None:
     """Return the run folder: a bare name is first of all one in ``runs``, anything else a path."""
@@ -35,18 +37,14 @@ def find_run(argument: str | None, runs: Path) -> Path:
     known = [file.parent for file in files]
     if argument is None:
         if not known:
-            raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
+            raise InputError(f"no run yet in {runs}", remedy=_FIRST)
         return known[0]
     if root := run_folder_of(argument, runs):
         return root
     folder = session_folder(argument)
     if not (folder / "session.toml").is_file():
-        remedy = choose_from(argument, [root.name for root in known])
-        raise InputError(
-            f"no run {argument!r}",
-            where=str(runs),
-            remedy=remedy or "start with `bampipe run SESSION`",
-        )
+        remedy = choose_from(argument, [root.name for root in known]) or _FIRST
+        raise InputError(f"no run {argument!r}", where=str(runs), remedy=remedy)
     root = runs / session_id(folder)
     if not (root / record.FILE).is_file():
         raise InputError(

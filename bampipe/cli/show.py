@@ -103,26 +103,17 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         ]
         for row in (head, *raw)
     ]
-    widths = [max(len(part) for row in lines for part in row[column]) for column in range(last + 1)]
-    right = [
-        bool(raw) and all(isinstance(row[column], int | float | None) for row in raw)
-        for column in range(len(head))
-    ]
-
-    def join(row: Sequence[str]) -> str:
-        parts = [
-            cell.rjust(width) if to_right else cell.ljust(width)
-            for cell, width, to_right in zip(row, widths, right, strict=True)
-        ]
-        return "  " + "  ".join(parts).rstrip()
-
+    forms = []
+    for column in range(len(head)):
+        is_number = bool(raw) and all(isinstance(row[column], int | float | None) for row in raw)
+        width = max(len(part) for row in lines for part in row[column])
+        forms.append(f"{'>' if is_number else '<'}{width}")
     for row in lines:
         for parts in zip_longest(*row, fillvalue=""):
-            say(join(parts))
+            say("  " + "  ".join(map(format, parts, forms)).rstrip())
 
 
-def _is_scalar(value: object) -> bool:
-    return value is None or isinstance(value, str | int | float | bool)
+_Scalar = str | int | float | None
 
 
 def _read_rows(value: object) -> list[dict[str, Any]]:
@@ -138,10 +129,11 @@ def _flatten(row: Mapping[str, Any], deep: bool) -> dict[str, Any]:
     """Return the columns of a record: scalars and, if ``deep``, tables of them key by key."""
     shown: dict[str, Any] = {name: row[name] for name in FIRST_COLUMNS if name in row}
     for name, value in row.items():
-        if _is_scalar(value):
+        if isinstance(value, _Scalar):
             shown[name] = value
-        elif deep and isinstance(value, Mapping) and value and all(map(_is_scalar, value.values())):
-            shown.update({f"{name} {key}": item for key, item in value.items()})
+        elif deep and isinstance(value, Mapping):
+            items = {f"{name} {key}": item for key, item in value.items()}
+            shown |= items if all(isinstance(item, _Scalar) for item in items.values()) else {}
         elif isinstance(value, list) and all(isinstance(item, str) for item in value):
             shown[name] = ", ".join(value)
     shown.pop("sentence", None)
@@ -279,14 +271,6 @@ def _print_model(model: str) -> None:
     say(f"\nmodel that counts: {model}; --model selects another")
 
 
-class _Line:
-    """The last line written about a step that is under way."""
-
-    def __init__(self, now: float) -> None:
-        self.started = self.written = now
-        self.fraction, self.message = 0.0, ""
-
-
 UNDER_WAY: dict[str, str] = {}
 """By run: the step that has started and not ended, or ""."""
 
@@ -304,7 +288,8 @@ class Watcher:
         self.several = several
         self.bars: Any = None
         self.tasks: dict[str, Any] = {}
-        self.lines: dict[str, _Line] = {}
+        self.lines: dict[str, tuple[float, Event]] = {}
+        self.written: dict[str, float] = {}
         self.lock, self.over = threading.Lock(), threading.Event()
 
     def __enter__(self) -> Watcher:
@@ -362,25 +347,27 @@ class Watcher:
     def _write(self, event: Event, name: str) -> None:
         """A line where a step starts, and one every so often while it goes on."""
         with self.lock:
+            now = time.monotonic()
             if event.kind == "start":
-                self.lines[name] = _Line(time.monotonic())
                 note(f"{name} ({event.message})" if event.message else name)
-            elif event.kind == "progress":
-                line = self.lines.setdefault(name, _Line(time.monotonic()))
-                line.fraction, line.message = event.fraction, event.message
+            if event.kind in ("start", "progress"):
+                self.lines[name] = (self.lines.get(name, (now,))[0], event)
+                self.written.setdefault(name, now)
             else:
                 self.lines.pop(name, None)
+                self.written.pop(name, None)
         self.write_late_lines()
 
     def write_late_lines(self) -> None:
         """Write a line on each step that has had none for some time."""
         with self.lock:
-            for name, line in self.lines.items():
+            for name, (started, event) in self.lines.items():
                 now = time.monotonic()
-                if now - line.written >= QUIET_S:
-                    line.written = now
-                    percent = f"{100.0 * line.fraction:.0f} %, {now - line.started:.0f} s"
-                    note(f"{name}: {percent}, {line.message}".removesuffix(", "))
+                if now - self.written[name] >= QUIET_S:
+                    self.written[name] = now
+                    percent = f"{100.0 * event.fraction:.0f} %, {now - started:.0f} s"
+                    said = event.message if event.kind == "progress" else ""
+                    note(f"{name}: {percent}, {said}".removesuffix(", "))
 
     def _draw(self, event: Event, name: str) -> None:
         if event.kind in ("start", "progress"):

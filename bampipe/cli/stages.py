@@ -168,9 +168,9 @@ def _choose_trajectory(form: str, out: Path | None, plan: bool) -> str:
     """Return the form of the trajectory's file, "" if none is asked for."""
     if form not in ("", "trajectory"):
         raise InputError(f"--as: unknown form {form!r}", remedy="--as trajectory")
+    if not form and out is not None:
+        raise InputError("--out needs --as", remedy="give --as trajectory with it")
     if not form:
-        if out is not None:
-            raise InputError("--out needs --as", remedy="give --as trajectory with it")
         return ""
     if plan:
         raise InputError(

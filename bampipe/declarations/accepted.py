@@ -15,6 +15,5 @@ class Accepted(Declaration):
     session: str = Field(description="Session whose values were accepted")
     recorded_at: str | None = Field(default=None, description="Time of that session's recording")
     model: Text = Field(description="Model version whose values were accepted")
-    results: dict[str, dict[str, dict[str, dict[str, Any]]]] = Field(
-        description="By file of the run folder, with {model} unresolved: accepted values from it"
-    )
+    results: dict[str, dict[str, dict[str, dict[str, Any]]]]
+    """By file of the run folder, with {model} unresolved: accepted values from it"""

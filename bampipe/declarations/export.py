@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -54,14 +54,11 @@ def export_model(run: RunFolder, name: str, form: Form) -> str:
     """
     system = compile_model(load_model(run, name))
     p = read_estimate(run, name, system)
-    writers: dict[Form, Callable[[], str]] = {
-        "json": lambda: _json(run, name, system, p),
-        "urdf": lambda: _urdf(run, system, p),
-        "mjcf": lambda: _mjcf(run, system, p),
-        "python": lambda: portable_source(system.model, p, "python"),
-        "c": lambda: portable_source(system.model, p, "c"),
-    }
-    return writers[form]()
+    if form == "python" or form == "c":
+        return portable_source(system.model, p, form)
+    if form == "json":
+        return _json(run, name, system, p)
+    return _urdf(run, system, p) if form == "urdf" else _mjcf(run, system, p)
 
 
 def _json(run: RunFolder, name: str, system: System, p: Array) -> str:
@@ -92,8 +89,12 @@ def _urdf(run: RunFolder, system: System, p: Array) -> str:
     said = gravity_at(drawn.before, drawn.base)[0] if drawn.urdf is not None else None
     if not np.allclose(robot.gravity, said or UPRIGHT):
         lacks.append(f"gravity in the frame of {drawn.base} ({number_list(robot.gravity)})")
-    lacks += [*_coupled(robot, drives), *(item.name for item in system.model.effects)]
-    comment = _head(drawn, lacks)
+    # Motors that move several joints couple them, which a URDF cannot express.
+    if np.any(drives != np.diag(np.diag(drives))):
+        lacks.append("inertia by which drives couple joints")
+    if shared := [name for name, motor in robot.motors.items() if len(motor.turns) > 1]:
+        lacks.append(f"friction of motors of several joints ({', '.join(shared)})")
+    comment = _head(drawn, [*lacks, *(item.name for item in system.model.effects)])
     if drawn.urdf is not None:
         return changed_urdf(drawn.urdf, drawn.before, drawn.after, comment)
     return urdf_text(system.model.device.name, drawn.flat, comment)
@@ -112,15 +113,6 @@ def _head(drawn: _Drawn, lacks: Sequence[str]) -> str:
     """Describe the origin of a model, moved masses, and the parts that the text lacks."""
     parts = ["identified by bampipe", *drawn.notes]
     return "; ".join([*parts, f"not in it: {', '.join(lacks)}"] if lacks else parts)
-
-
-def _coupled(robot: Robot, drives: Array) -> list[str]:
-    """List the couplings by motors that move several joints, which a URDF cannot express."""
-    lacks = []
-    if np.any(np.abs(drives - np.diag(np.diag(drives))) > 0.0):
-        lacks.append("inertia by which drives couple joints")
-    shared = [name for name, motor in robot.motors.items() if len(motor.turns) > 1]
-    return lacks + ([f"friction of motors of several joints ({', '.join(shared)})"] * bool(shared))
 
 
 @dataclass(frozen=True)
@@ -166,8 +158,10 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
         notes.append(f"masses fixed to a link are part of that link, not of {join_names(emptied)}")
     if robot.payload is not None:
         notes.append(f"the payload of {robot.payload.mass:g} kg is in the last link that moves")
-    overdrawn = _overdrawn(bodies, after)
-    if overdrawn:
+    # Links that become impossible once the drawn bodies beside the chain are subtracted.
+    child_of = {identifier(joint.name): joint.child for joint in after.joints}
+    possible = (child_of[joint] for joint, body in bodies.items() if body.is_possible)
+    if overdrawn := [link for link in possible if not after.bodies[link].is_possible]:
         notes.append(
             f"no possible body remains for {join_names(overdrawn)}: the bodies beside the chain"
             " there are drawn too heavy"
@@ -175,16 +169,6 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
     urdf = file if read_xml(file).tag == "robot" else None
     flat = hold_beside(after, robot.base, robot.tip)
     return _Drawn(urdf, before, after, flat, robot.base, tuple(notes))
-
-
-def _overdrawn(identified: Mapping[str, Body], after: Tree) -> list[str]:
-    """Find links that become impossible once the drawn bodies beside the chain are subtracted."""
-    links = {identifier(joint.name): joint.child for joint in after.joints}
-    return [
-        links[joint]
-        for joint, body in identified.items()
-        if body.is_possible and not after.bodies[links[joint]].is_possible
-    ]
 
 
 def _drive_inertia(system: System, p: Array) -> Array:
@@ -219,9 +203,12 @@ def _identified_joints(
     drives = dict(zip(system.coordinates, np.diag(_drive_inertia(system, p)), strict=True))
     bodies, limits = {}, {}
     for joint in robot.joints:
-        bodies[joint.name] = _body(
-            np.array([value[f"{name}.{joint.name}"] for name in INERTIAL_NAMES])
-        )
+        # Mass, centre and central inertia from the ten numbers about the joint.
+        numbers = np.array([value[f"{name}.{joint.name}"] for name in INERTIAL_NAMES])
+        mass = float(numbers[0])
+        center = numbers[1:4] / mass if mass != 0.0 else np.zeros(3)
+        inertia = symmetric(numbers[4:]) - Body(mass, center).about(np.zeros(3))
+        bodies[joint.name] = Body(mass, center, inertia)
         lower, upper = system.model.device.limits.get(joint.name, (0.0, 0.0))
         limits[joint.name] = DriveLimits(
             lower,
@@ -233,11 +220,3 @@ def _identified_joints(
             armature=float(drives.get(joint.name, 0.0)),
         )
     return bodies, limits
-
-
-def _body(numbers: Array) -> Body:
-    """Return mass, centre and central inertia from the ten numbers about the joint."""
-    mass = float(numbers[0])
-    center = numbers[1:4] / mass if mass != 0.0 else np.zeros(3)
-    inertia = symmetric(numbers[4:]) - Body(mass, center).about(np.zeros(3))
-    return Body(mass, center, inertia)

@@ -57,8 +57,9 @@ def device_faults(declaration: Mapping[str, Any], where: str) -> tuple[str, list
         return "", faults
     try:
         return describe_equations(device), []
-    except InputError as error:
-        return "", [_named(error, where)]
+    except InputError as error:  # located in the file, not by the derivation's name for the device
+        error.where = ": ".join(filter(None, (where, error.where.partition(": ")[2])))
+        return "", [str(error)]
 
 
 def effect_faults(
@@ -74,7 +75,10 @@ def effect_faults(
     effect = registry.effect_from(declaration, where)
     targets = (target,) if target else effect.targets(device)
     if not targets:
-        return [], [f"{where}: {_unfit(effect, device)}"]
+        why = f"device '{device.name}' has nothing that it can act on, or lacks a name that it uses"
+        if effect.devices and device.name not in effect.devices:
+            why = f"made for {', '.join(effect.devices)}, not for device '{device.name}'"
+        return [], [f"{where}: {why}"]
     found: dict[str, None] = {}
     for place in targets:
         try:
@@ -83,16 +87,3 @@ def effect_faults(
             lines = [str(error)]
         found |= dict.fromkeys(f"{where}: {line}" for line in lines)
     return [f"{effect.name}:{place}" if place else effect.name for place in targets], list(found)
-
-
-def _unfit(effect: Effect, device: Device) -> str:
-    if effect.devices and device.name not in effect.devices:
-        return f"made for {', '.join(effect.devices)}, not for device '{device.name}'"
-    return f"device '{device.name}' has nothing that it can act on, or lacks a name that it uses"
-
-
-def _named(error: InputError, where: str) -> str:
-    """Return the error located in the file, instead of the derivation's name for the device."""
-    place = error.where.partition(": ")[2]
-    return str(InputError(error.what, where=f"{where}: {place}" if place else where,
-                          remedy=error.remedy))  # fmt: skip

@@ -162,10 +162,11 @@ def _load(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
 
 def _presliding(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
     left = w.remaining_friction(item.target) - v.force
-    if left >= 0.0:
-        w.friction[item.target] = left
-        w.add_bristles(item.target, v.force / v.distance, 0.0, v.force, v.force, 1.0)
-    return bool(left >= 0.0)
+    if left < 0.0:
+        return False
+    w.friction[item.target] = left
+    w.add_bristles(item.target, v.force / v.distance, 0.0, v.force, v.force, 1.0)
+    return True
 
 
 def _stribeck(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:

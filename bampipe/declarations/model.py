@@ -14,17 +14,14 @@ class ModelFile(Declaration):
     """A model of a run folder."""
 
     schema_: Literal["bampipe.model/1"] = Field(default="bampipe.model/1", alias="schema")
-    name: Text = Field(
-        description="Name of the model; a child's is its parent's, then + and each added effect"
-    )
+    name: Text
+    """Name of the model; a child's is its parent's, then + and each added effect"""
     parent: str = Field(default="", description="Name of the parent; empty for the base model")
     device: Text = Field(description="Name of the device")
     effects: Several[Text] = Field(default=(), description="Effects, name[:target]")
-    start: dict[str, float] = Field(
-        default={},
-        description="Initial values for identification, by parameter of an effect; those not given"
-        " are searched for",
-    )
+    start: dict[str, float] = Field(default={})
+    """Initial values for identification, by parameter of an effect; those not given are searched
+    for"""
 
     def text(self) -> str:
         """Return the model as TOML."""

@@ -49,27 +49,22 @@ class Gate(Declaration):
     divide_by: NumberPath = Field(
         default="", description="a dotted path of a number by which the value is divided"
     )
-    against: Literal["", "accepted"] = Field(
-        default="",
-        description="Judge the change from the accepted values instead, in percent; a change beyond"
-        " the limit, but within two standard deviations, only warns",
-    )
+    against: Literal["", "accepted"] = ""
+    """Judge the change from the accepted values instead, in percent; a change beyond the limit, but
+    within two standard deviations, only warns"""
     judged_by: NumberPath = Field(
         default="", description="a dotted path of a word that says whether the value passes"
     )
     passes: Distinct[Text] = Field(default=(), description="Words of judged_by that pass")
-    max: Number | None = Field(
-        default=None, description="Largest value that passes; for a list, the most entries"
-    )
+    max: Number | None = None
+    """Largest value that passes; for a list, the most entries"""
     min: Number | None = Field(default=None, description="Smallest value that passes")
-    level: Literal["fail", "warn"] = Field(
-        default="fail", description="fail: exit code 1; warn: reported, but the run counts as good"
-    )
+    level: Literal["fail", "warn"] = "fail"
+    """fail: exit code 1; warn: reported, but the run counts as good"""
     optional: bool = Field(default=False, description="Whether a missing result passes")
     advice: str = Field(default="", description="What to do if the gate does not pass")
-    advice_on: dict[str, Text] = Field(
-        default={}, description="Other advice for some words of judged_by, by word"
-    )
+    advice_on: dict[str, Text] = Field(default={})
+    """Other advice for some words of judged_by, by word"""
 
     def cross_faults(self) -> Iterator[InputError]:
         if self.max is None and self.min is None and not self.judged_by:
@@ -83,31 +78,25 @@ class Gate(Declaration):
 class BaseModelTable(Declaration):
     """The base model, if it differs from the bare device of the session."""
 
-    device: str = Field(
-        default="", description="Device of the base model; the session's by default"
-    )
-    effects: Distinct[Text] = Field(
-        default=(), description="Effects of the base model, name[:target]"
-    )
+    device: str = ""
+    """Device of the base model; the session's by default"""
+    effects: Distinct[Text] = ()
+    """Effects of the base model, name[:target]"""
 
 
 class Pipeline(Declaration):
     """Work of ``bampipe run``."""
 
     schema_: Literal["bampipe.pipeline/1"] = Field(alias="schema")
-    name: Annotated[str, StringConstraints(pattern="^[A-Za-z0-9_-]+$")] = Field(
-        description="Letters, digits, '_' and '-'"
-    )
+    name: Annotated[str, StringConstraints(pattern="^[A-Za-z0-9_-]+$")]
+    """Letters, digits, '_' and '-'"""
     summary: str = Field(default="", description="Purpose of the pipeline, in one sentence")
-    stages: Annotated[Several[StageName], AfterValidator(_in_order), Field(min_length=1)] = Field(
-        description="The stages, in order"
-    )
-    model: BaseModelTable = Field(
-        default=BaseModelTable(), description="The base model, if it is not the bare device"
-    )
-    settings: dict[StageName, dict[str, Any]] = Field(
-        {}, description="By stage: fields of its configuration that replace the defaults"
-    )
+    stages: Annotated[Several[StageName], AfterValidator(_in_order), Field(min_length=1)]
+    """The stages, in order"""
+    model: BaseModelTable = BaseModelTable()
+    """The base model, if it is not the bare device"""
+    settings: dict[StageName, dict[str, Any]] = Field(default={})
+    """By stage: fields of its configuration that replace the defaults"""
     gates: Several[Gate] = Field(default=(), description="Limits for the results")
     _where: str = PrivateAttr("")
 

@@ -104,9 +104,10 @@ def gather_recording(run: RunFolder) -> Recording:
         if run.exists(DiagnoseResult.file(model)):
             markers += _mark(run.read(DiagnoseResult, model), offsets)
     moment = datetime.fromisoformat(session.recorded_at) if session.recorded_at else None
-    tree = read_tree(run.path(DRAWING)) if run.exists(DRAWING) else None
-    text = run.path(DRAWING).read_text(encoding="utf-8") if tree is not None else ""
-    poses, frames = _pose_links(tree, motion, offsets) if tree is not None else (np.zeros(0), ())
+    text, poses, frames = "", np.zeros(0), tuple[Frame, ...]()
+    if run.exists(DRAWING):
+        text = run.path(DRAWING).read_text(encoding="utf-8")
+        poses, frames = _pose_links(read_tree(run.path(DRAWING)), motion, offsets)
     units = {axis: "N.m" if session.axes[axis].unit == "rad" else "N" for axis in signals}
     return Recording(
         name=run.root.name,

@@ -66,11 +66,11 @@ def _place(robot: Robot) -> list[_Placed]:
     found = []
     for joint in robot.joints:
         turn, before = known[joint.after]
-        place = before + turn @ np.array(joint.position)
+        place = before + turn @ joint.position
         turn = turn @ rotation_matrix(joint.rotation)
         known[joint.name] = turn, place
-        axis = turn @ np.array(joint.axis) / np.linalg.norm(joint.axis)
-        found.append(_Placed(joint, before, place, axis, place + turn @ np.array(joint.center)))
+        axis = turn @ joint.axis / np.linalg.norm(joint.axis)
+        found.append(_Placed(joint, before, place, axis, place + turn @ joint.center))
     return found
 
 

@@ -1,10 +1,11 @@
 """The device of a session, checked against the session's channels; and its placeholders."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 
 from bampipe.data.device_file import read_device_file
 from bampipe.data.session import Session
-from bampipe.errors import InputError, did_you_mean
+from bampipe.errors import InputError, did_you_mean, located
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.units import parse_unit
@@ -17,7 +18,12 @@ def session_device(session: Session) -> Device:
         InputError: there is no such device, or channels for its axes and inputs are missing or
             have another name or unit; all faults are listed.
     """
-    device = _device(session)
+    if session.device_file is not None:
+        place = session.device_file
+        device = registry.device_from(read_device_file(place), str(place))
+    else:
+        with located(f"{session.root / 'session.toml'}: device"):
+            device = registry.device(session.device)
     found = list(_mismatches(session, device))
     if found:
         first, *others = found
@@ -32,18 +38,6 @@ def placeholders(table: object, place: str = "device") -> Iterator[str]:
             yield place
         for name, entry in table.items():
             yield from placeholders(entry, f"{place}.{name}")
-
-
-def _device(session: Session) -> Device:
-    path = session.device_file
-    if path is not None:
-        return registry.device_from(read_device_file(path), str(path))
-    try:
-        return registry.device(session.device)
-    except InputError as error:
-        raise InputError(
-            error.what, where=f"{session.root / 'session.toml'}: device", remedy=error.remedy
-        ) from error
 
 
 def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
@@ -84,7 +78,7 @@ def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
         expected = wanted.get(channel.name, channel.unit)
         if device.robot is not None and (channel.unit, expected) == ("N", "N.m"):
             continue  # the drive of a sliding joint: its force along the joint
-        if not _alike(channel.unit, expected):
+        if not _is_alike(channel.unit, expected):
             yield InputError(
                 f"a unit of {channel.unit or 'a pure number'}, but device '{device.name}' takes"
                 f" {expected or 'a pure number'}",
@@ -100,11 +94,8 @@ def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
         )
 
 
-def _alike(one: str, other: str) -> bool:
+def _is_alike(one: str, other: str) -> bool:
     """Whether two units have the same dimension; unreadable units differ."""
-    if one == other:
-        return True
-    try:
-        return parse_unit(one, "") == parse_unit(other, "")
-    except InputError:
-        return False
+    with suppress(InputError):
+        return one == other or parse_unit(one, "") == parse_unit(other, "")
+    return False

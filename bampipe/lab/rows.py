@@ -1,6 +1,5 @@
 """From one run folder to its rows in the tables of the lab."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -105,17 +104,9 @@ def _add_model(
 def _add_trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, float]) -> None:
     if not run.exists("ingest/trials.parquet"):
         return
-    frame = store.read_parquet(run.path("ingest/trials.parquet"))
-    for trial in frame.to_dict("records"):
-        numbers = {name: float(trial[name]) for name in ("duration_s", "sample_rate_hz")}
-        rows.add(
-            "quality",
-            trial_id=str(trial["trial_id"]),
-            n_samples=int(trial["n_samples"]),
-            nis=nis.get(str(trial["trial_id"])),
-            **{name: str(trial[name]) for name in ("kind", "status", "reason", "repairs")},
-            **{name: x if math.isfinite(x) else None for name, x in numbers.items()},
-        )
+    frame = store.read_parquet(run.path("ingest/trials.parquet")).astype(object)
+    for trial in frame.where(frame.notna(), None).to_dict("records"):
+        rows.add("quality", nis=nis.get(trial["trial_id"]), **trial)
 
 
 def _add_session(

@@ -50,22 +50,17 @@ def build_trends(tables: Tables) -> TrendsResult:
 def _make_charts(tables: Tables) -> list[ControlChart]:
     """Chart the parameters of the base models, and the stiffnesses."""
     found: dict[tuple[str, str, str], list[tuple[str, float, float]]] = {}
-    rows = [
-        (row, str(row["parameter"]), row["estimate"])
-        for row in tables.get("parameters", ())
-        if row["model"] == BASE
-    ]
+    bases = (r for r in tables.get("parameters", ()) if r["model"] == BASE)
+    rows = [(r, r["parameter"], r["estimate"]) for r in bases]
     rows += [(r, f"stiffness.{r['axis']}", r["stiffness"]) for r in tables.get("stiffness", ())]
     for row, name, value in rows:
-        if value is not None:
-            key = (str(row["device"]), name, str(row["unit"] or ""))
-            entry = (str(row["session_id"]), float(value), float(row["sd"] or 0.0))
-            found.setdefault(key, []).append(entry)
+        entry = (row["session_id"], value, row["sd"])
+        found.setdefault((row["device"], name, row["unit"]), []).append(entry)
     return [make_chart(*key, entries) for key, entries in sorted(found.items())]
 
 
 def _judge_session(row: TableRow, tables: Tables, charts: Sequence[ControlChart]) -> SessionVerdict:
-    session, device, model = str(row["session_id"]), str(row["device"]), row["counting_model"]
+    session, device, model = row["session_id"], row["device"], row["counting_model"]
     mine = {
         name: [r for r in tables.get(name, ()) if r["session_id"] == session]
         for name in ("parameters", "errors", "verdicts")
@@ -81,17 +76,11 @@ def _judge_session(row: TableRow, tables: Tables, charts: Sequence[ControlChart]
         for point in chart.points
         if chart.device == device and point.session == session and point.outside_limits
     }
-    moved = [
-        MovedParameter.of(
-            chart,
-            parameter=chart.name,
-            estimate=point.estimate,
-            percent=100.0 * (point.estimate - chart.centre) / abs(chart.centre)
-            if chart.centre
-            else None,
-        )
-        for chart, point in outside.items()
-    ]
+    moved = []
+    for chart, point in outside.items():
+        by, about = point.estimate - chart.centre, {"parameter": chart.name}
+        percent = 100.0 * by / abs(chart.centre) if chart.centre else None
+        moved.append(MovedParameter.of(chart, point, **about, percent=percent))
     judged = SessionVerdict(
         session=session,
         device=device,
@@ -128,7 +117,9 @@ def _explain_model(
         limits = "; no parameter is beyond its limits" if limited else ""
         return EFFECT, f"lacks {join_names(lacking)}{limits}", ""
     if not judged.diagnosed and judged.worst and judged.above_floor:
-        return UNKNOWN, phrases.describe_error(judged.worst), _diagnose_command(judged)
+        error = f"error on unseen trials {judged.worst[0]:.3g} times the floor on {judged.worst[1]}"
+        said = f"{error}: something is missing, and no diagnosis has been made"
+        return UNKNOWN, said, _diagnose_command(judged)
     if unjudged := _list_unjudged(judged, verdicts):
         return UNKNOWN, f"no verdict on {unjudged}", f"bampipe report {judged.session}"
     return IN_CONTROL, "", ""
@@ -193,7 +184,7 @@ def _refit_outside(
     With a model that has the effect, its estimates decide; without one, the effect accounts neither
     for a parameter of an axis on which nothing is missing, nor for a stiffness, which no model has.
     """
-    models = {str(r["model"]) for r in mine["parameters"]} - {BASE}
+    models = {r["model"] for r in mine["parameters"]} - {BASE}
     largest = max(models, key=lambda name: (name.count("+"), name), default="")
     chosen = judged.model if judged.model != BASE else largest
     child = {r["parameter"]: r for r in mine["parameters"] if r["model"] == chosen}
@@ -205,9 +196,8 @@ def _refit_outside(
     back: list[str] = []
     still: list[str] = []
     for chart, point in outside.items():
-        row = child.get(chart.name)
-        if row is not None and row["estimate"] is not None:
-            inside = _is_within(chart, point, float(row["estimate"]), float(row["sd"] or 0.0))
+        if row := child.get(chart.name):
+            inside = _is_within(chart, point, row["estimate"], row["sd"])
             (back if inside else still).append(chart.name)
         elif chart.name.startswith("stiffness.") or chart.name.rpartition(".")[2] in clean:
             still.append(chart.name)

@@ -93,30 +93,19 @@ class Monitor:
             return content
         model, n = self.start.model, len(self.system.coordinates)
         mean, sd = self._filter.mean, np.sqrt(np.diag(self._filter.covariance))
+        names = ("position", "position_sd", "velocity", "velocity_sd")
+        values = np.column_stack([mean[:n], sd[:n], mean[n : 2 * n], sd[n : 2 * n]]).tolist()
         content["state"] = {
-            axis: {
-                "position": float(mean[i]),
-                "position_sd": float(sd[i]),
-                "velocity": float(mean[n + i]),
-                "velocity_sd": float(sd[n + i]),
-            }
-            for i, axis in enumerate(self.system.coordinates)
+            axis: dict(zip(names, row, strict=True))
+            for axis, row in zip(self.system.coordinates, values, strict=True)
         }
-        theta, spread = mean[model.n_states :], sd[model.n_states :]
-        low, value, high = (
-            np.clip(
-                model.to_physical(theta + side * NORMAL_95 * spread)[0], model.lower, model.upper
-            )
-            for side in (-1.0, 0.0, 1.0)
-        )
+        theta, half = mean[model.n_states :], NORMAL_95 * sd[model.n_states :]
+        ends = (model.to_physical(at)[0] for at in (theta, theta - half, theta + half))
+        rows = np.column_stack([np.clip(end, model.lower, model.upper) for end in ends]).tolist()
+        free = [self.system.parameters[place] for place in model.free]
         content["parameters"] = {
-            self.system.parameters[place].name: {
-                "estimate": float(value[i]),
-                "lower": float(low[i]),
-                "upper": float(high[i]),
-                "unit": self.system.parameters[place].unit,
-            }
-            for i, place in enumerate(model.free)
+            one.name: {"estimate": value, "lower": low, "upper": high, "unit": one.unit}
+            for one, (value, low, high) in zip(free, rows, strict=True)
         }
         ratio, axes = self._test.ratio, self.system.coordinates
         content["nis"] = {
@@ -139,14 +128,10 @@ class Monitor:
 
     def _arrange_inputs(self, names: Sequence[str], values: Array) -> Array:
         brakes = {name: f"brake_{axis}" for axis, name in self.system.model.device.brakes.items()}
-        u = np.zeros((len(values), len(self.system.inputs)))
-        for place, name in enumerate(self.system.inputs):
-            column = brakes.get(name, name)
-            if name == "t":
-                u[:, place] = values[:, 0] - self._first_t
-            elif column in names:
-                u[:, place] = values[:, names.index(column)]
-        return u
+        given = dict(zip(names, values.T, strict=True)) | {"t": values[:, 0] - self._first_t}
+        absent = np.zeros(len(values))
+        columns = [given.get(brakes.get(name, name), absent) for name in self.system.inputs]
+        return np.column_stack(columns) if columns else np.zeros((len(values), 0))
 
     def _filter_samples(self, t: Array, u: Array, q: Array) -> None:
         """Filter samples in stretches; a gap between them restarts the motion."""
@@ -160,16 +145,14 @@ class Monitor:
 
     def _filter_stretch(self, t: Array, u: Array, q: Array) -> None:
         start, test = self.start, self._test
-        if start is None or test is None:
-            raise RuntimeError("samples before the start")
+        assert start is not None and test is not None
         if self._filter is None:
-            complete_rows = np.flatnonzero(np.isfinite(q).all(axis=1))
-            self._add_unfiltered(
-                np.isfinite(q[: complete_rows[0] if complete_rows.size else len(t)])
-            )
-            if not complete_rows.size:
+            rows = np.flatnonzero(np.isfinite(q).all(axis=1))
+            first = int(rows[0]) if rows.size else len(t)
+            self._add_unfiltered(np.isfinite(q[:first]))
+            if not rows.size:
                 return
-            t, u, q = t[complete_rows[0] :], u[complete_rows[0] :], q[complete_rows[0] :]
+            t, u, q = t[first:], u[first:], q[first:]
             x, x_sd = start.state(self.system, q[0], u[0])
             self._filter = OnlineFilter(
                 start.model, start.settings, x, x_sd, start.theta, start.covariance

@@ -174,10 +174,8 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
             where=str(run.path(path)),
             remedy=f"bampipe identify {run.root} --set method=ukf",
         )
-    values = system.prior
-    names = found.covariance.names
-    for parameter in names:
-        values[system.index(parameter)] = found.parameters[parameter].estimate
+    values, names = system.prior, found.covariance.names
+    values[[system.index(name) for name in names]] = [found.parameters[n].estimate for n in names]
     ingested = run.read(IngestResult)
     if ingested.kept_every > 1:
         raise InputError(
@@ -206,9 +204,8 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
         stride=max(trial.t.size for trial in trials),
     )
     n = len(system.coordinates)
-    speed = np.sqrt(
-        np.mean([np.mean(np.square(_find_speeds(trial)), axis=0) for trial in trials], 0)
-    )
+    squares = [np.mean(np.square(_find_speeds(trial)), axis=0) for trial in trials]
+    speed = np.sqrt(np.mean(squares, axis=0))
     window = max(2, round(options.window_s * rate))
     start = Start(
         model, settings, theta, covariance, np.maximum(speed, 1e-3),

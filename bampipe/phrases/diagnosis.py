@@ -123,10 +123,8 @@ def advise_trial(entry: AxisVerdict) -> str:
             "A lag weakens fast changes, a delay does not: log at a higher rate, and record trials"
             " in which the force changes faster."
         )
-    return (
-        "No trial was found that would distinguish them; `bampipe next --for decision` looks for"
-        " one."
-    )
+    look = "`bampipe next --for decision` looks for one."
+    return f"No trial was found that would distinguish them; {look}"
 
 
 def missing_effects(found: DiagnoseResult, axis: str, mark: str = "") -> str:
@@ -238,11 +236,8 @@ def _describe_addition(entry: AxisVerdict, result: DiagnoseResult) -> str:
 
 def _describe_unknown(entry: AxisVerdict, result: DiagnoseResult) -> str:
     """Return that no effect explains the rest, with the probability that something is left."""
-    none = (
-        "no set of as many effects as may be added explains"
-        if result.cut_short
-        else "no effect of the library explains"
-    )
+    most = "no set of as many effects as may be added explains"
+    none = most if result.cut_short else "no effect of the library explains"
     return f"{none} ({_PROBABILITY}{probability(entry.unknown)})"
 
 

@@ -91,23 +91,18 @@ def compare_forecast(
     for pair in best.confusion[:_MOST_NAMED]:
         first, second = pair.between
         text = f"{first} or {second}: the forecast chance of confusion was {say_chance(pair.after)}"
-        if diagnosed is None:
-            said.append(f"{text}; `bampipe diagnose RUN` tells the outcome.")
-        else:
-            said.append(f"{text}; {_name_alternative(first, second, diagnosed)}.")
+        tells = "`bampipe diagnose RUN` tells the outcome"
+        if diagnosed is not None:
+            tells = _name_alternative(first, second, diagnosed)
+        said.append(f"{text}; {tells}.")
     return (*said, *_compare_revealed(proposed, diagnosed))
 
 
 def _name_alternative(first: str, second: str, diagnosed: DiagnoseResult) -> str:
     """Say which of two alternatives a diagnosis found, as a clause."""
     one, other = split_effects(first), split_effects(second)
-    open_effects = {
-        name
-        for axis in diagnosed.axes.values()
-        if axis.verdict == "undecided"
-        for name in axis.probabilities
-    }
-    if open_effects & (one ^ other):
+    undecided = (axis for axis in diagnosed.axes.values() if axis.verdict == "undecided")
+    if {name for axis in undecided for name in axis.probabilities} & (one ^ other):
         return "the trials still do not distinguish them"
     there = [name for name in (first, second) if split_effects(name) <= {*diagnosed.selected}]
     named = max(there, key=lambda name: len(split_effects(name)), default=NOTHING)

@@ -17,14 +17,6 @@ def list_moved(moved: Iterable[MovedParameter]) -> str:
     return ", ".join(parts)
 
 
-def describe_error(worst: tuple[float, str]) -> str:
-    """Return the error of a model that no diagnosis has explained."""
-    return (
-        f"error on unseen trials {worst[0]:.3g} times the floor on {worst[1]}: something is"
-        " missing, and no diagnosis has been made"
-    )
-
-
 def describe_shift(
     moved: str, lacking: Sequence[str], back: Sequence[str], still: Sequence[str]
 ) -> str:

@@ -31,13 +31,11 @@ def describe_journey(one: Journey) -> str:
     line = f"The model of {one.model_of}"
     if not one.failed:
         return f"{line} travels to {one.trials_of}."
-    entries = {axis: one.axes[axis] for axis in one.failed}
-    errors = join_names(
-        f"{axis} ({e.error:.3g} {e.unit}; own model {e.own_error:.3g}"
-        + (f", floor {e.noise_floor:.3g})" if e.noise_floor else ")")
-        for axis, e in entries.items()
-    )
-    line += f" does not travel to {one.trials_of} on {errors}."
+    errors = []
+    for axis, e in ((axis, one.axes[axis]) for axis in one.failed):
+        floor = f", floor {e.noise_floor:.3g}" if e.noise_floor else ""
+        errors.append(f"{axis} ({e.error:.3g} {e.unit}; own model {e.own_error:.3g}{floor})")
+    line += f" does not travel to {one.trials_of} on {join_names(errors)}."
     reached = [
         axis
         for axis in one.failed

@@ -34,10 +34,9 @@ def say_trajectory(found: Trajectory) -> list[str]:
         " collisions: the model does not know obstacles."
     ]
     if found.assumed:
-        axes = join_names(found.assumed, _MOST_NAMED)
         said.append(
-            f"No acceleration limit is stated for {axes} ([limits]); the highest in these trials is"
-            " used."
+            f"No acceleration limit is stated for {join_names(found.assumed, _MOST_NAMED)}"
+            " ([limits]); the highest in these trials is used."
         )
     return said
 
@@ -126,12 +125,11 @@ def _say_unseen(found: NextResult, unbraked: Sequence[str]) -> str:
         for name, entry in table.items()
         if entry.smallest is None and entry.with_proposal is None and name not in unbraked
     ]
+    every = "every other effect" if never or unbraked or unpromised else "every effect"
+    why = f"These trials would have shown {every} of the library at its typical size."
     if hidden:
         sizes = join_names([_say_size(name, table[name]) for name in hidden], _MOST_NAMED)
         why = f"These trials would not have shown {sizes}."
-    else:
-        every = "every other effect" if never or unbraked or unpromised else "every effect"
-        why = f"These trials would have shown {every} of the library at its typical size."
     if never:
         one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
         names = join_names(never, _MOST_NAMED)

@@ -33,6 +33,11 @@ def describe_hum(hum: MainsHum) -> str:
     )
 
 
+def describe_placeholder(place: str) -> str:
+    """Return that a number of the device file still has to be filled in."""
+    return f"{place}: still a placeholder, with `fill in` as its source"
+
+
 def describe_dead_stretch(stretch: DeadStretch) -> str:
     """Return why the readings of a column are not used."""
     if stretch.missing:
@@ -62,8 +67,7 @@ def find_failed_checks(
     session: IngestResult, identified: IdentifyResult, errors: Mapping[str, JudgedError]
 ) -> Iterator[str]:
     """Yield a sentence on every check that a model fails, whose ``errors`` are by axis."""
-    for place in session.placeholders:
-        yield f"{place}: still a placeholder, with `fill in` as its source"
+    yield from map(describe_placeholder, session.placeholders)
     for axis, channel in session.axes.items():
         if channel.resolution == 0.0:
             yield f"{axis}: resolution and noise of the encoder are not known"

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import datetime
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from bampipe.report import page, style, typeset
 from bampipe.report.document import Document, Figure, Section
@@ -34,12 +34,8 @@ class Report:
     @classmethod
     def from_document(cls, document: Document, recorded: int, explorer: str = "") -> Report:
         """Return the files of ``document``; see `typeset.render_pdf` for ``recorded``."""
-        figures = {
-            block.name: block.svg
-            for section in document.sections
-            for block in section.blocks
-            if isinstance(block, Figure)
-        }
+        blocks = (block for section in document.sections for block in section.blocks)
+        figures = {block.name: block.svg for block in blocks if isinstance(block, Figure)}
         titles = tuple(section.title for section in document.sections)
         html = page.render_page(document, "explore.html" if explorer else "")
         return cls(typeset.render_pdf(document, recorded), html, explorer, figures, titles)
@@ -55,29 +51,17 @@ def build_run_report(results: Results, progress: Callable[[float, str], None]) -
             blocks = tuple(module.list_blocks(results))
         if blocks:
             sections.append(Section(module.TITLE, blocks))
-    title = f"Session {results.session.session_id}"
-    document = Document(title, _make_subtitle(results), tuple(sections))
+    session, seconds = results.session, 0
+    parts = ["simulated"] if session.simulated else []
+    parts.append(f"device {session.device} {session.device_serial}".rstrip())
+    if session.recorded_at:
+        when = datetime.fromisoformat(session.recorded_at)
+        parts.append(f"recorded {when:%Y-%m-%d %H:%M}{' UTC' * (not when.utcoffset())}")
+        seconds = max(0, int((when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()))
+    if session.operator:
+        parts.append(f"by {session.operator}")
+    document = Document(f"Session {session.session_id}", ", ".join(parts), tuple(sections))
     progress(0.7, "page for exploring")
     explorer = explorer_page(results, document.subtitle)
     progress(0.85, "typesetting")
-    when = _read_moment(results)
-    if when is not None and when.tzinfo is None:
-        when = when.replace(tzinfo=datetime.UTC)
-    return Report.from_document(document, max(0, int(when.timestamp())) if when else 0, explorer)
-
-
-def _make_subtitle(results: Results) -> str:
-    session, when = results.session, _read_moment(results)
-    parts = ["simulated"] if session.simulated else []
-    parts.append(f"device {session.device} {session.device_serial}".rstrip())
-    if when:
-        is_utc = when.utcoffset() == datetime.timedelta(0)
-        parts.append(f"recorded {when:%Y-%m-%d %H:%M}{' UTC' if is_utc else ''}")
-    if session.operator:
-        parts.append(f"by {session.operator}")
-    return ", ".join(parts)
-
-
-def _read_moment(results: Results) -> datetime.datetime | None:
-    recorded = results.session.recorded_at
-    return datetime.datetime.fromisoformat(recorded) if recorded else None
+    return Report.from_document(document, seconds, explorer)

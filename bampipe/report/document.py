@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
-from bampipe.report.wording import format_prose
+from bampipe.report.wording import format_entry, format_prose
 
 Tone = Literal["good", "attention", "unknown", "note"]
 Span = tuple[Literal["plain", "strong", "code", "link"], str]
@@ -23,6 +23,7 @@ _MARK = re.compile(
 )
 
 _COLUMN = re.compile(r"(?P<right>>?)(?P<title>.*?)(?: ~(?P<width>[\d.]+))?", re.DOTALL)
+_FORM = re.compile(r" :(\S+)")
 
 
 def split_spans(text: str) -> list[Span]:
@@ -109,15 +110,22 @@ class Table:
     Attributes:
         caption: what it shows.
         columns: titles, units included, joined by `` | ``. ``>`` before a title stands for a
-            column of numbers; ``~2`` after it is the relative width of a column whose text wraps.
-        rows: the cells, formatted.
+            column of numbers; `` :p`` after it is the form of its cells (`wording.format_entry`),
+            ``~2`` the relative width of a column whose text wraps.
+        rows: the cells, which are text once the table is made.
         note: a sentence below, or "".
     """
 
     caption: str
     columns: str
-    rows: Sequence[tuple[str, ...]]
+    rows: Sequence[tuple[Any, ...]]
     note: str = ""
+
+    def __post_init__(self) -> None:
+        forms = [found[1] if (found := _FORM.search(c)) else "" for c in self.columns.split(" | ")]
+        rows = tuple(tuple(map(format_entry, row, forms)) for row in self.rows)
+        object.__setattr__(self, "rows", rows)
+        object.__setattr__(self, "columns", _FORM.sub("", self.columns))
 
     def read_columns(self) -> list[Column]:
         """Return the columns."""

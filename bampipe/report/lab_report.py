@@ -1,6 +1,6 @@
 """The report over all sessions of a lab: verdicts, control charts, errors, trials."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 
@@ -14,12 +14,9 @@ from bampipe.report import style
 from bampipe.report.build import Report
 from bampipe.report.document import Block, Callout, Document, Paragraph, Section, Table, Tone
 from bampipe.report.wording import (
-    NONE,
     choose_scale,
     format_digits,
     format_p_value,
-    format_unit,
-    format_with_sd,
     name_parameter,
     split_name,
 )
@@ -45,20 +42,15 @@ def build_lab_report(folder: Path, pages: Mapping[str, str]) -> Report:
     with style.use_style():
         sections = [_summarise(trends, pages), *_show_charts(trends)]
         sections += [*_show_errors(folder, trends), *_show_trials(folder)]
-    moments = [one.recorded for one in trends.sessions if one.recorded]
-    document = Document("All sessions", _make_subtitle(trends, moments), tuple(sections))
-    stamps = (int(datetime.fromisoformat(moment).timestamp()) for moment in moments)
-    return Report.from_document(document, max(0, *stamps, 0))
-
-
-def _make_subtitle(trends: TrendsResult, moments: Sequence[str]) -> str:
     devices = sorted({one.device for one in trends.sessions})
     parts = [count_noun(len(trends.sessions), "session")]
-    parts.append(f"device{'s' if len(devices) > 1 else ''} {join_names(devices)}")
-    days = sorted({moment[:10] for moment in moments})
-    if days:
+    parts.append(f"device{'s' * (len(devices) > 1)} {join_names(devices)}")
+    moments = [one.recorded for one in trends.sessions if one.recorded]
+    if days := sorted({moment[:10] for moment in moments}):
         parts.append(days[0] if len(days) == 1 else f"recorded {days[0]} to {days[-1]}")
-    return ", ".join(parts)
+    document = Document("All sessions", ", ".join(parts), tuple(sections))
+    stamps = (int(datetime.fromisoformat(moment).timestamp()) for moment in moments)
+    return Report.from_document(document, max(0, *stamps, 0))
 
 
 def _summarise(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
@@ -84,17 +76,14 @@ def _summarise(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
     }
     rows = [
         (
-            links.get(one.session, one.session),
-            one.recorded[:16].replace("T", " ") or NONE,
-            f"`{one.model}`",
-            f"{format_digits(one.worst[0])} ({one.worst[1]})" if one.worst else NONE,
-            ", ".join(moved.parameter for moved in one.moved) or NONE,
-            verdicts[one.session],
+            *(links.get(one.session, one.session), one.recorded[:16].replace("T", " ") or None),
+            *(one.model, f"{format_digits(one.worst[0])} ({one.worst[1]})" if one.worst else None),
+            *(", ".join(moved.parameter for moved in one.moved) or None, verdicts[one.session]),
         )
         for one in trends.sessions
     ]
     columns = (
-        "Session | Recorded (UTC) | Best confirmed model ~1.2 | >Error / floor, worst axis"
+        "Session | Recorded (UTC) | Best confirmed model :code ~1.2 | >Error / floor, worst axis"
         " | Beyond its limits ~1 | Verdict ~0.8"
     )
     note = "Error of that model on unseen trials over the noise floor of sensors and filters."
@@ -115,7 +104,7 @@ def _show_charts(trends: TrendsResult) -> Iterator[Section]:
     devices = sorted({one.device for one in trends.series})
     for place, device in enumerate(devices, start=1):
         charts = [one for one in trends.series if one.device == device]
-        title = "Parameters over time" + (f", {device}" if len(devices) > 1 else "")
+        title = "Parameters over time" + f", {device}" * (len(devices) > 1)
         if all(len(chart.points) == 1 for chart in charts):
             name = charts[0].points[0].session
             text = f"This device has one session, {name}: there is nothing to compare."
@@ -174,8 +163,7 @@ def _draw_chart(panel: Axes, chart: ControlChart) -> None:
         )  # fmt: skip
     style.set_limits(panel, shown)
     _name_sessions(panel, [point.session for point in points])
-    panel.set_title(name_parameter(chart.name))
-    panel.set_ylabel(unit)
+    panel.set(title=name_parameter(chart.name), ylabel=unit)
 
 
 def _name_sessions(panel: Axes, names: list[str]) -> None:
@@ -191,27 +179,18 @@ def _tabulate_charts(charts: list[ControlChart]) -> Table:
     rows = []
     for chart in charts:
         within, centre = float(np.median([point.sd for point in chart.points])), chart.centre
-        trend = NONE
+        trend = None
         if chart.slope_per_session is not None and centre:
             slope = format_digits(100.0 * chart.slope_per_session / abs(centre), 2)
             trend = f"{slope} % (p {format_p_value(chart.slope_p)})"
-        rows.append(
-            (
-                name_parameter(chart.name),
-                # Without control limits the scatter of the centre is not known.
-                format_with_sd(centre, chart.between_sd or within)
-                if chart.has_limits
-                else format_digits(centre),
-                format_unit(chart.unit),
-                format_digits(chart.between_sd, 2),
-                format_digits(within, 2),
-                trend,
-                "; ".join(phrases.list_signs(chart)) or NONE,
-            )
-        )
+        # Without control limits the scatter of the centre is not known.
+        shown = (centre, chart.between_sd or within) if chart.has_limits else centre
+        signs = "; ".join(phrases.list_signs(chart)) or None
+        rows.append((chart.name, shown, chart.unit, chart.between_sd, within, trend, signs))
     return Table(
         "Centre and scatter of each parameter",
-        "Parameter | >Centre | Unit | >Between | >Within | >Trend a session | Signs ~1",
+        "Parameter :name | >Centre | Unit :unit | >Between :2 | >Within :2 | >Trend a session"
+        " | Signs ~1",
         rows,
         "Between: scatter between sessions, without the uncertainty within them. Within: median "
         "standard deviation of a session's estimate. Trend: median slope (Theil and Sen), and the "
@@ -245,10 +224,8 @@ def _show_errors(folder: Path, trends: TrendsResult) -> Iterator[Section]:
         ticks = [tick for tick in _TICKS if low <= tick]
         panel.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
         panel.minorticks_off()
-        panel.set_ylim(low, high)
         _name_sessions(panel, sessions)
-        panel.set_title(axis)
-        panel.set_ylabel("error / floor")
+        panel.set(ylim=(low, high), title=axis, ylabel="error / floor")
     caption = "Error on unseen trials over the noise floor, session by session."
     text = (
         "The noise floor is the error that sensors and filters leave if the model is exactly "
@@ -273,12 +250,12 @@ def _show_trials(folder: Path) -> Iterator[Section]:
     if not odd.empty:
         rows = [
             (
-                str(row["session_id"]),
-                str(row["trial_id"]),
-                split_name(str(row["status"])),
-                str(row["reason"] or row["repairs"] or NONE),
+                one.session_id,
+                one.trial_id,
+                split_name(one.status),
+                one.reason or one.repairs or None,
             )
-            for row in odd.head(_MOST_TRIALS).to_dict("records")
+            for one in odd.head(_MOST_TRIALS).itertuples()
         ]
         more = len(odd) - _MOST_TRIALS
         note = f"{more} more in the table `quality`." if more > 0 else ""

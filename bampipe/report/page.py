@@ -97,15 +97,11 @@ def _render_table(table: Table, number: str) -> str:
         for column in columns
     )
     looks = [column.side if column.width else f"{column.side} whole" for column in columns]
-    rows = "\n".join(
-        "<tr>{}</tr>".format(
-            "".join(
-                f'<td class="{look}">{_render_spans(cell, breaking=True)}</td>'
-                for look, cell in zip(looks, row, strict=True)
-            )
-        )
-        for row in table.rows
-    )
+
+    def render_cell(look: str, text: str) -> str:
+        return f'<td class="{look}">{_render_spans(text, breaking=True)}</td>'
+
+    rows = "\n".join(f"<tr>{''.join(map(render_cell, looks, row))}</tr>" for row in table.rows)
     note = f'<p class="remark">{_render_spans(table.note)}</p>' if table.note else ""
     return (
         f'<div class="scroll"><table><caption class="caption"><strong>{number}</strong> '

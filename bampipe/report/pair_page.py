@@ -5,7 +5,6 @@ from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Callout, Document, Figure, Section, Table, Tone
 from bampipe.report.page import render_page
 from bampipe.report.sections.diagnosis import draw_maps
-from bampipe.report.wording import format_digits, format_p_value, format_unit
 from bampipe.results.pair import PairResult
 
 
@@ -14,40 +13,40 @@ def tabulate_pair(pair: PairResult) -> list[Table]:
     sides, axes = (pair.first, pair.second), list(pair.journeys[0].axes)
     parameters = [
         (
-            name, *map(format_digits, (one.first, one.first_sd, one.second, one.second_sd)),
-            format_unit(one.unit), format_digits(one.standard_errors),
-            format_p_value(one.p_value), "yes" if one.changed else "",
+            *(name, one.first, one.first_sd, one.second, one.second_sd, one.unit),
+            *(one.standard_errors, one.p_value, "yes" if one.changed else ""),
         )
         for name, one in pair.parameters.items()
-    ]  # fmt: skip
+    ]
     verdicts = [("model", *(f"`{side.model}`" for side in sides))]
     verdicts += [(x, *(side.verdicts.get(x, "not diagnosed") for side in sides)) for x in axes]
     travels = [
         (
-            one.model_of, one.trials_of, axis,
-            *map(format_digits, (e.error, e.own_error, e.noise_floor, e.limit)),
-            format_unit(e.unit), "yes" if e.travels else "no",
+            *(one.model_of, one.trials_of, axis),
+            *(e.error, e.own_error, e.noise_floor, e.limit, e.unit, e.travels),
         )
         for one in pair.journeys
         for axis, e in one.axes.items()
-    ]  # fmt: skip
+    ]
     refits = [
         (
             one.model_of, ", ".join(f"{name} {by:+.3g}" for name, by in refit.changes.items()),
-            *(format_digits(refit.errors[axis]) for axis in axes), ", ".join(refit.travels),
+            *(refit.errors[axis] for axis in axes), ", ".join(refit.travels),
         )
         for one in pair.journeys
         for refit in (*one.alone, one.together)
         if refit is not None and (refit is not one.together or len(refit.changes) > 1)
     ]  # fmt: skip
     a, b = (side.session for side in sides)
-    columns = f"Parameter | >{a} | >sd | >{b} | >sd | Unit | >Change/se | >p (Holm) | Changed"
+    columns = f"Parameter | >{a} | >sd | >{b} | >sd | Unit :unit | >Change/se | >p (Holm) :p"
+    columns += " | Changed"
     found = [
         Table("Parameters", columns, parameters, "Change/se: difference over its standard error."),
         Table("Verdicts", f"Axis | {a} ~1 | {b} ~1", verdicts),
         Table(
             "Prediction of the other session's trials, RMSE",
-            "Model of | Trials of | Axis | >Error | >Own model | >Floor | >Limit | Unit | Travels",
+            "Model of | Trials of | Axis | >Error | >Own model | >Floor | >Limit | Unit :unit"
+            " | Travels",
             travels,
             "Own model: its held-out error at home. Travels: error within the limit.",
         ),

@@ -6,7 +6,7 @@ from bampipe.report import typeset
 from bampipe.report.document import Block, Bullets, Document, Paragraph, Section, Table
 from bampipe.report.sections.next_trial import tabulate_confusion, tabulate_sds
 from bampipe.report.wording import format_decimals
-from bampipe.results.next import Plan, PlannedSd
+from bampipe.results.next import Plan
 
 _BY_HAND = "Tare the force sensor with the hand off the handle."
 _BY_DRIVE = "Check the path for obstacles: the model does not know them."
@@ -41,38 +41,28 @@ def _sheet(
     blocks: list[Block] = [Paragraph(plan.sentence)]
     if plan.trials:
         rows = [
-            (f"{trial.times} times" if trial.times > 1 else "once", trial.sentence, "")
-            for trial in plan.trials
+            (f"{t.times} times" if t.times > 1 else "once", t.sentence, "") for t in plan.trials
         ]
         blocks.append(Table("Trials", " | Motion ~4 | Files ~1", rows))
     if plan.sd:
         blocks.append(_tabulate_uncertainties(plan, model, listed))
     if plan.confusion:
         title = "Probability of confusion"
-        blocks.append(tabulate_confusion(title, ">now | >expected", plan.confusion))
-    before = (_BY_HAND if by_hand else _BY_DRIVE, *_BEFORE)
+        blocks.append(tabulate_confusion(title, ("now", "expected"), plan.confusion))
     sections = [Section("The trials", tuple(blocks))]
     if plan.trials:
-        first, last = (
-            Section(title, (Bullets(items),))
-            for title, items in (("Before each trial", before), ("After the last one", _AFTER))
-        )
-        sections = [first, *sections, last]
-    return Document(
-        f"Trials to record: {session}",
-        f"Model {model}, {format_decimals(plan.seconds, 0)} s in all",
-        tuple(sections),
-        scale,
-    )
+        before = Bullets((_BY_HAND if by_hand else _BY_DRIVE, *_BEFORE))
+        sections.insert(0, Section("Before each trial", (before,)))
+        sections.append(Section("After the last one", (Bullets(_AFTER),)))
+    about = f"Model {model}, {format_decimals(plan.seconds, 0)} s in all"
+    return Document(f"Trials to record: {session}", about, tuple(sections), scale)
 
 
 def _tabulate_uncertainties(plan: Plan, model: str, listed: int) -> Table:
     """Tabulate the standard deviations farthest above the required limit."""
 
-    def left(entry: PlannedSd) -> float:
-        return entry.after / entry.asked if entry.asked > 0.0 else 0.0
-
-    far = set(sorted(plan.sd, key=lambda name: -left(plan.sd[name]))[:listed])
+    left = {name: e.after / e.asked if e.asked > 0.0 else 0.0 for name, e in plan.sd.items()}
+    far = set(sorted(left, key=lambda name: -left[name])[:listed])
     table = tabulate_sds("Standard deviations", {n: e for n, e in plan.sd.items() if n in far})
     if len(far) == len(plan.sd):
         return table

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from bampipe.report import document
-from bampipe.report.wording import break_lines, choose_scale, format_unit
+from bampipe.report.wording import break_lines, choose_scale, format_unit, split_name
 
 COLOURS = {
     "ink": "#1c2024", "faint": "#b4b8bd", "blue": "#0072b2", "vermillion": "#d55e00",
@@ -88,23 +88,19 @@ def make_grid(
     return figure, list(axes.flat[:count])
 
 
-def split_figure(rows: int, height: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure of one panel on the left and ``rows`` panels on the right, left one first."""
+def split_figure(height: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure of one panel on the left and two on the right, in this order."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    cells = figure.add_gridspec(rows, 2, width_ratios=(1.0, 1.7))
-    left = figure.add_subplot(cells[:, 0])
-    return figure, [left, *(figure.add_subplot(cells[row, 1]) for row in range(rows))]
+    return figure, list(figure.subplot_mosaic("AB;AC", width_ratios=(1.0, 1.7)).values())
 
 
 def finish(
     figure: Figure, name: str, caption: str, legend_from: Sequence[Axes] = ()
 ) -> document.Figure:
     """Return the block of a figure, with a common legend of these panels below."""
-    handles, names = [], []
-    for axes in legend_from:
-        more_handles, more_names = axes.get_legend_handles_labels()
-        handles += more_handles
-        names += more_names
+    found = [axes.get_legend_handles_labels() for axes in legend_from]
+    names = [name for _, own in found for name in own]
+    handles = [handle for own, _ in found for handle in own]
     if names:
         columns = int(figure.get_figwidth() / (_LETTER * max(map(len, names)) + _HANDLE))
         columns = max(1, min(_MOST_LEGEND_COLUMNS, columns, len(names)))
@@ -157,6 +153,23 @@ def break_heading(name: str, columns: int) -> str:
 def thin(length: int, most: int) -> slice:
     """Return every n-th sample, so that at most about ``most`` are drawn."""
     return slice(0, length, max(1, -(-length // most)))
+
+
+def draw_curve(
+    axes: Axes, band: tuple[Sequence[float], ...], variable: str, unit: str, **look: Any
+) -> None:
+    """Draw a force with its band over a variable.
+
+    Args:
+        band: the variable, and the mean, lower and upper end of the force there.
+        variable: its name, in files; unit: its unit; look: of the line.
+    """
+    at, mean, low, high = band
+    x, shown = scale_values(np.array(at), unit)
+    axes.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0)
+    axes.plot(x, mean, color=BLUE, **look)
+    axes.axhline(0.0, color=INK, lw=0.5)
+    axes.set_xlabel(label_axis(split_name(variable), shown))
 
 
 def draw_series(

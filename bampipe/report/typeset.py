@@ -6,7 +6,6 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from bampipe.report.document import (
     Callout,
     Document,
     Figure,
-    Span,
     Table,
     number_blocks,
     split_spans,
@@ -104,13 +102,11 @@ def _print(document: Document, recorded: int) -> tuple[bytes, int]:
 def _describe_block(block: Block, number: str) -> dict[str, Any]:
     """Return the block as the template reads it, its text split into spans."""
     shown: dict[str, Any] = {"kind": type(block).__name__.lower(), "number": number}
-    for field in fields(block):
-        value = getattr(block, field.name)
-        if isinstance(block, Callout) and field.name == "text":
+    for name, value in vars(block).items():
+        if isinstance(block, Callout) and name == "text":
             value = value.splitlines()
-        if field.name != "svg":
-            is_verbatim = field.name in _VERBATIM
-            shown[field.name] = value if is_verbatim else _split_spans(value)
+        if name != "svg":
+            shown[name] = value if name in _VERBATIM else _split_spans(value)
     if isinstance(block, Table):
         columns = block.read_columns()
         letters = sum(len(cell) for row in block.rows for cell in row)
@@ -128,10 +124,9 @@ def _split_spans(text: str | Sequence[Any]) -> list[Any]:
     """Return the spans of a text, or of each in a sequence: a link is its words."""
     if not isinstance(text, str):
         return [_split_spans(item) for item in text]
-    shown: list[Span] = []
+    shown = []
     for kind, body in split_spans(text):
-        if kind == "link":
-            shown.append(("plain", body.partition("\n")[0]))
-        else:  # a unit stays on the line of its number
-            shown.append((kind, body if kind == "code" else _BEFORE_UNIT.sub("\u00a0", body)))
+        # A unit stays on the line of its number.
+        words = body if kind == "code" else _BEFORE_UNIT.sub("\u00a0", body.partition("\n")[0])
+        shown.append(("plain" if kind == "link" else kind, words))
     return shown or [("plain", "")]

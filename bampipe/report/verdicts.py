@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from bampipe.lists import count_noun, join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.phrases.results import STANDINGS
-from bampipe.report.document import Callout
+from bampipe.report.document import Callout, Tone
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits
 from bampipe.results.diagnose import DiagnoseResult
@@ -24,10 +24,10 @@ def describe_held_out(validated: ValidateResult) -> str:
         return "each part of the trial predicted with the estimate from its other parts"
     if len(names) == len(validated.trials):
         return "each trial predicted with the estimate from the others"
+    which = f"trial{'s' * (len(names) > 1)} {join_names(names)}"
     if len(names) > _MOST_NAMED:
-        return f"{len(names)} of the {len(validated.trials)} trials, which no parameter has seen"
-    trials = "trial" if len(names) == 1 else "trials"
-    return f"{trials} {join_names(names)}, which no parameter has seen"
+        which = f"{len(names)} of the {len(validated.trials)} trials"
+    return f"{which}, which no parameter has seen"
 
 
 def judge_session(results: Results) -> Callout:
@@ -102,15 +102,16 @@ def _judge_diagnosis(results: Results, diagnosis: DiagnoseResult) -> Callout:
         found = [axis for axis, entry in axes.items() if entry.verdict == verdict]
         return {axis: phrases.missing_effects(diagnosis, axis, "`") for axis in found}
 
+    tone: Tone = "attention"
     if lacking := find("missing"):
-        parts = "; ".join(f"{words} on {axis}" for axis, words in lacking.items())
-        return Callout("attention", f"{model} lacks {parts}", sentence)
-    if unknown := find("unknown_effect"):
-        title = f"Something that no known effect explains acts on {join_names(unknown)}"
-        return Callout("unknown", title, sentence)
-    if unjudged := find("no_verdict"):
-        return Callout("attention", f"No verdict on {join_names(unjudged)}", sentence)
-    if undecided := find("undecided"):
-        parts = "; ".join(f"{axis}: {words}" for axis, words in undecided.items())
-        return Callout("attention", f"Undecided on {parts}", sentence)
-    return Callout("good", f"{model} explains this session: nothing is missing", sentence)
+        title = f"{model} lacks {'; '.join(f'{what} on {axis}' for axis, what in lacking.items())}"
+    elif unknown := find("unknown_effect"):
+        tone, title = "unknown", "Something that no known effect explains acts on "
+        title += join_names(unknown)
+    elif unjudged := find("no_verdict"):
+        title = f"No verdict on {join_names(unjudged)}"
+    elif undecided := find("undecided"):
+        title = f"Undecided on {'; '.join(map(': '.join, undecided.items()))}"
+    else:
+        tone, title = "good", f"{model} explains this session: nothing is missing"
+    return Callout(tone, title, sentence)

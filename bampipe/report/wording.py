@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 from bampipe.results import rounding
 
@@ -119,6 +120,31 @@ def format_p_value(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return NONE
     return "< 0.001" if value < 0.001 else format_digits(value, 2)
+
+
+_FORMS: dict[str, Callable[[Any], str]] = {
+    "": format_digits,
+    "2": lambda value: format_digits(value, 2),
+    "%": format_percent,
+    "p": format_p_value,
+    "code": "`{}`".format,
+    "name": lambda name: name_parameter(name),
+    "unit": format_unit,
+}
+"""How the cells of a table are printed, by the form of their column."""
+
+
+def format_entry(value: Any, form: str = "") -> str:
+    """Return the cell of a table: a number, a value with its sd, whether something is so, or text.
+
+    None is `NONE`, whatever the ``form``; text in a column of numbers is printed as it is.
+    """
+    if value is None or isinstance(value, tuple):
+        return NONE if value is None else format_with_sd(*value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    is_text = isinstance(value, str) and form not in ("code", "name", "unit")
+    return value if is_text else _FORMS[form](value)
 
 
 def break_lines(text: str, most: int, behind: str = " _") -> str:

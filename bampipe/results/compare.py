@@ -27,15 +27,13 @@ class Rung(Record):
     held_out_rmse: dict[str, Size]
     noise_floor: dict[str, Size | None] = Field(description="null if none was computed")
     standing: dict[str, FloorStatus]
-    confirmed: bool = Field(
-        description="A model without a parent, or one with a confirmed parent and a lower"
-        " held-out error than that; not a model without a noise floor if its parent has one"
-    )
+    confirmed: bool
+    """A model without a parent, or one with a confirmed parent and a lower held-out error than
+    that; not a model without a noise floor if its parent has one"""
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
-    free_run_reason: str = Field(
-        default="", description="Why there is no free run, or none in closed loop"
-    )
+    free_run_reason: str = ""
+    """Why there is no free run, or none in closed loop"""
     free_run: dict[str, FreeRunError] = Field(default={}, description="By axis")
     drift: dict[str, AxisDrift] = Field(default={}, description="By axis: short free runs")
 
@@ -96,9 +94,8 @@ class Moved(Record):
 class CompareResult(Result, file="compare.json", stage="compare"):
     """The ladder of model versions on the same held-out trials."""
 
-    best: str = Field(
-        description="The model used by default: the confirmed one with the lowest held-out error"
-    )
+    best: str
+    """The model used by default: the confirmed one with the lowest held-out error"""
     ladder: tuple[Rung, ...] = Field(min_length=1, description="Parents before children")
     parameters: dict[str, dict[str, Value]] = Field(description="By name, then by model")
     moved: tuple[Moved, ...]

@@ -24,25 +24,21 @@ class AxisVerdict(Record):
     unknown: Share = Field(description="Probability that an effect outside the library is missing")
     rmse_before: Size = Field(description="On held-out trials")
     rmse_after: Size = Field(description="With the most probable set")
-    rmse_beyond_bias: Size = Field(
-        description="With it, without the bias that filters leave where friction changes its sign"
-    )
+    rmse_beyond_bias: Size
+    """With it, without the bias that filters leave where friction changes its sign"""
     noise_floor: Size = Field(description="Error of replicates of the final model")
     noise_floor_sd: Size
     standing: FloorStatus = Field(description="rmse_after against noise_floor")
     unit: str
     force_rms: Size = Field(description="Root mean square of the applied force")
-    explained: UpToOne = Field(
-        description="Share of the mean square of the applied force that the final model explains"
-    )
-    explainable_share: UpToOne = Field(
-        description="Share of the residual, in the mean square, that a smooth function of position,"
-        " speed, load and time since reversal predicts on unseen trials"
-    )
+    explained: UpToOne
+    """Share of the mean square of the applied force that the final model explains"""
+    explainable_share: UpToOne
+    """Share of the residual, in the mean square, that a smooth function of position, speed, load
+    and time since reversal predicts on unseen trials"""
     explainable_after: UpToOne = Field(description="The same of the final model")
-    explained_by_effects: UpToOne = Field(
-        description="Share of the excess mean square that the most probable set removes"
-    )
+    explained_by_effects: UpToOne
+    """Share of the excess mean square that the most probable set removes"""
     remains: bool = Field(description="Whether the set leaves something unexplained")
     sentence: str
 
@@ -58,11 +54,10 @@ class RankedEffect(Record):
     effect: str
     axis: str
     held_out_rmse_before: Size = Field(description="Of the model diagnosed")
-    held_out_rmse_after: Size = Field(
-        description="For an effect of the most probable set, error without and with it beside the"
-        " others; otherwise of the diagnosed model with it alone, as if both sides of the"
-        " equation kept their size"
-    )
+    held_out_rmse_after: Size
+    """For an effect of the most probable set, error without and with it beside the others;
+    otherwise of the diagnosed model with it alone, as if both sides of the equation kept their
+    size"""
     unit: str
     probability: Share
     p_value: Share = Field(description="Probability that replicates give any candidate such a gain")
@@ -134,20 +129,16 @@ class DiagnoseResult(Result, file="models/{model}/diagnose.json", stage="diagnos
     next: str = Field(description="The command or action that follows")
     axes: dict[str, AxisVerdict] = Field(min_length=1)
     ranking: tuple[RankedEffect, ...] = Field(description="Best first")
-    descriptions: dict[str, EffectText] = Field(
-        default={}, description="Text of the effect file, by name of an effect in the ranking"
-    )
+    descriptions: dict[str, EffectText] = Field(default={})
+    """Text of the effect file, by name of an effect in the ranking"""
     selected: Names
-    fitted: dict[str, float] = Field(
-        default={}, description="Parameters of the effects of the final model, in SI units"
-    )
+    fitted: dict[str, float] = Field(default={})
+    """Parameters of the effects of the final model, in SI units"""
     sets: tuple[WeighedSet, ...] = Field(description="The most probable first")
-    chance: NullDistribution | None = Field(
-        default=None, description="null if replicates do not resemble the measurement"
-    )
-    cut_short: bool = Field(
-        default=False, description="Whether the search stopped at the largest set allowed"
-    )
+    chance: NullDistribution | None = None
+    """null if replicates do not resemble the measurement"""
+    cut_short: bool = False
+    """Whether the search stopped at the largest set allowed"""
     suggested_trial: SuggestedTrial | None
     not_weighed: Names = Field(default=(), description="Effects left out of the search on request")
     maps: dict[str, dict[str, ResidualMap]] = Field(description="By axis, then variable")

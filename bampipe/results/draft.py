@@ -30,9 +30,8 @@ class DraftCurve(Record):
     mean: tuple[float, ...]
     low: tuple[float, ...] = Field(description="95 % band by the constants' covariance")
     high: tuple[float, ...]
-    beside: dict[str, float] = Field(
-        description="Other variables of the formula, with the value at which the curve is drawn"
-    )
+    beside: dict[str, float]
+    """Other variables of the formula, with the value at which the curve is drawn"""
 
 
 class DraftedEffect(Record):
@@ -79,9 +78,8 @@ class AxisDraft(Record):
 
     verdict: DraftVerdict
     effects: Names = Field(description="Drafted effects, which `extend` adds")
-    chance: tuple[ChanceOfDraft, ...] = Field(
-        min_length=1, description="Search of the first formula, and of the second one if any"
-    )
+    chance: tuple[ChanceOfDraft, ...] = Field(min_length=1)
+    """Search of the first formula, and of the second one if any"""
     options: tuple[DraftOption, ...] = Field(description="Shortest first")
     rmse_before: Size = Field(description="On held-out trials")
     rmse_after: Size

@@ -23,9 +23,8 @@ class AxisDifferentiation(Record):
     unit: Literal["rad", "m"]
     bandwidth_hz: Positive
     bandwidth_reason: str
-    order: int | None = Field(
-        default=None, description="Order of the Kalman smoother's motion model"
-    )
+    order: int | None = None
+    """Order of the Kalman smoother's motion model"""
     resolution: Size
     quantisation_sd: Size
     measurement_noise_sd: Size
@@ -59,15 +58,11 @@ class FilterResult(Result, file="filter/filter.json", stage="filter"):
     sample_rate_hz: Positive
     axes: dict[str, AxisDifferentiation] = Field(min_length=1)
     force: ForceFilter
-    bridged_fraction: dict[str, Share] = Field(
-        description="By trial: share of its grid without samples"
-    )
+    bridged_fraction: dict[str, Share]
+    """By trial: share of its grid without samples"""
     skipped: dict[str, str] = Field(description="By trial: reason why it was skipped")
-    disturbances: dict[str, tuple[Disturbance, ...]] = Field(
-        default_factory=dict, description="By trial: excluded stretches"
-    )
-    force_offsets: dict[str, dict[str, float]] = Field(
-        default_factory=dict,
-        description="By trial and force, N, N.m or A: offset from the mean of the trials, for a"
-        " sensor that was zeroed anew in each; it has been subtracted",
-    )
+    disturbances: dict[str, tuple[Disturbance, ...]] = Field(default_factory=dict)
+    """By trial: excluded stretches"""
+    force_offsets: dict[str, dict[str, float]] = Field(default_factory=dict)
+    """By trial and force, N, N.m or A: offset from the mean of the trials, for a sensor that was
+    zeroed anew in each; it has been subtracted"""

@@ -18,30 +18,20 @@ class ParameterEstimate(Record):
     sd: Size = Field(description="Standard deviation: block-wise sandwich, and the parts below")
     unit: str
     at_bound: bool = Field(description="Within one sd of its physical bound")
-    filter_sd: Size | None = Field(
-        default=None,
-        description="Standard deviation of the filter alone, valid for white noise only",
-    )
-    smoothing_sd: Size | None = Field(
-        default=None,
-        description="Part of sd due to the smoothed sign of a velocity; 0 if the machine creeps"
-        " as the model does, null if the method excludes standstill",
-    )
-    calibration_sd: Size | None = Field(
-        default=None,
-        description="Part of sd from the stated uncertainty of sensors and constants, and from"
-        " encoder zeros that are known to one step; null without any",
-    )
-    statistical_sd: Size | None = Field(
-        default=None, description="The rest of sd; null if all of it is statistical"
-    )
-    least_squares_bias: float | None = Field(
-        default=None,
-        description="Bias of least squares by filters and friction at standstill, subtracted",
-    )
-    bound_sd: Size | None = Field(
-        description="Cramer-Rao bound: least sd that the sensors allow; null without one"
-    )
+    filter_sd: Size | None = None
+    """Standard deviation of the filter alone, valid for white noise only"""
+    smoothing_sd: Size | None = None
+    """Part of sd due to the smoothed sign of a velocity; 0 if the machine creeps as the model does,
+    null if the method excludes standstill"""
+    calibration_sd: Size | None = None
+    """Part of sd from the stated uncertainty of sensors and constants, and from encoder zeros that
+    are known to one step; null without any"""
+    statistical_sd: Size | None = None
+    """The rest of sd; null if all of it is statistical"""
+    least_squares_bias: float | None = None
+    """Bias of least squares by filters and friction at standstill, subtracted"""
+    bound_sd: Size | None
+    """Cramer-Rao bound: least sd that the sensors allow; null without one"""
 
 
 class Covariance(Record):
@@ -61,15 +51,11 @@ class MethodValue(Record):
 class MethodTried(Record):
     """Parameters by one method, and their error on held-out trials."""
 
-    held_out_rmse: dict[str, Size] = Field(
-        default={}, description="By axis, N.m or N; empty without parameters"
-    )
+    held_out_rmse: dict[str, Size] = Field(default={})
+    """By axis, N.m or N; empty without parameters"""
     parameters: dict[str, MethodValue] = Field(default={}, description="By name")
-    disagrees: Names = Field(
-        default=(),
-        description="Parameters that differ from the published ones by more than twice the"
-        " uncertainty of both",
-    )
+    disagrees: Names = ()
+    """Parameters that differ from the published ones by more than twice the uncertainty of both"""
     doubts: Names = Field(default=(), description="Reasons to distrust it")
 
 
@@ -79,29 +65,26 @@ class WorstSecond(Record):
     trial: str
     start_s: Size = Field(description="Since the start of the trial, s")
     parameter: str
-    move: float = Field(
-        description="Change of that parameter without this second, in its standard deviations"
-    )
+    move: float
+    """Change of that parameter without this second, in its standard deviations"""
     sentence: str = Field(default="", description="Explanation of a transient or an outlier")
 
 
 class Influence(Record):
     """Influence of parts of the data on the parameters."""
 
-    trials: dict[str, dict[str, float]] = Field(
-        description="By trial, or block of a single one, then by parameter and `input_timing`:"
-        " change of the least-squares estimate without it, in published standard deviations."
-        " More than ten trials form ten groups"
-    )
+    trials: dict[str, dict[str, float]]
+    """By trial, or block of a single one, then by parameter and `input_timing`: change of the
+    least-squares estimate without it, in published standard deviations. More than ten trials form
+    ten groups"""
     worst_second: WorstSecond
 
 
 class EffectEstimate(Record):
     """Whether the trials determine an effect of the model."""
 
-    has_strength: bool = Field(
-        default=True, description="Whether its strengths, taken together, differ from zero at 95 %"
-    )
+    has_strength: bool = True
+    """Whether its strengths, taken together, differ from zero at 95 %"""
     identified: bool
     reasons: Names = Field(default=(), description="Reasons why it does not count as identified")
 
@@ -116,15 +99,12 @@ class InputTiming(Record):
     estimate: float
     sd: Size = Field(description="0 if it was not estimated")
     unit: Literal["s"]
-    limit: Size = Field(
-        default=0.0, description="Largest value, half a sample; 0 if it was not estimated"
-    )
-    of_residual: float = Field(
-        default=0.0,
-        description="Timing with the least residual within the limit, s, including the bias of"
-        " filters at reversals; for a robot the one on which most drives agree away from"
-        " reversals; 0 if the trials show none. Residuals are compared at this timing",
-    )
+    limit: Size = 0.0
+    """Largest value, half a sample; 0 if it was not estimated"""
+    of_residual: float = 0.0
+    """Timing with the least residual within the limit, s, including the bias of filters at
+    reversals; for a robot the one on which most drives agree away from reversals; 0 if the trials
+    show none. Residuals are compared at this timing"""
 
     @property
     def is_at_limit(self) -> bool:
@@ -188,11 +168,9 @@ class Convergence(Record):
 
     converged: bool
     iterations: Count | None = Field(default=None, description="Of least squares")
-    settled_s: dict[str, Size] | None = Field(
-        default=None,
-        description="Time after which each estimate stays within 2 % or 3 sd of its final value, "
-        "s from the start of the first run",
-    )
+    settled_s: dict[str, Size] | None = None
+    """Time after which each estimate stays within 2 % or 3 sd of its final value, s from the start
+    of the first run"""
     total_s: Size | None = Field(default=None, description="Of the first run and the last")
 
 
@@ -222,10 +200,8 @@ class DeviceNumber(Record):
     bound_sd: Size | None
     partner: str | None
     correlation: float
-    moves_percent: dict[str, float] = Field(
-        description="Change of each estimate that is known to 10 % for an error of 1 % in this"
-        " number, per cent"
-    )
+    moves_percent: dict[str, float]
+    """Change of each estimate that is known to 10 % for an error of 1 % in this number, per cent"""
 
 
 class Combined(Record):
@@ -275,23 +251,19 @@ class IdentifyResult(Result, file="models/{model}/identify.json", stage="identif
     methods: dict[Method, MethodTried] = Field(description="Every method tried, published first")
     engine: Literal["compiled", "filterpy"]
     trials: Names = Field(description="Free trials used")
-    parameters: dict[str, ParameterEstimate] = Field(
-        description="By name: viscous.<axis>, coulomb.<axis>, mass, <effect>[.<axis>].<parameter>"
-    )
-    effects: dict[str, EffectEstimate] = Field(
-        default={},
-        description="By effect of the model. An effect does not count as identified if its"
-        " strength or shape is at a bound or has an interval larger than itself",
-    )
+    parameters: dict[str, ParameterEstimate]
+    """By name: viscous.<axis>, coulomb.<axis>, mass, <effect>[.<axis>].<parameter>"""
+    effects: dict[str, EffectEstimate] = Field(default={})
+    """By effect of the model. An effect does not count as identified if its strength or shape is at
+    a bound or has an interval larger than itself"""
     influence: Influence
     covariance: Covariance
     input_timing: InputTiming
     state_3sigma: dict[str, StateBound] = Field(description="By axis")
     convergence: Convergence
     identifiability: IdentifiabilityReport | None = None
-    base_parameters: tuple[BaseEstimate, ...] | None = Field(
-        default=None, description="Base parameters of a robot, from the base to the tip"
-    )
+    base_parameters: tuple[BaseEstimate, ...] | None = None
+    """Base parameters of a robot, from the base to the tip"""
     sign_width_factor: Annotated[float, Field(gt=0, le=1)] = Field(
         default=1.0,
         description="Width of the smoothed sign of the velocities over the device's `sign_width`;"
@@ -301,12 +273,10 @@ class IdentifyResult(Result, file="models/{model}/identify.json", stage="identif
     nis: Consistency | None = None
     innovations: dict[str, InnovationTests] | None = Field(default=None, description="By axis")
     noise: NoiseLevels | None = None
-    residual_sd: dict[str, Size] | None = Field(
-        default=None, description="Least squares: low-passed residual by axis, N.m or N"
-    )
-    blocks: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="Independent blocks of time"
-    )
+    residual_sd: dict[str, Size] | None = None
+    """Least squares: low-passed residual by axis, N.m or N"""
+    blocks: Annotated[int, Field(ge=1)] | None = None
+    """Independent blocks of time"""
     restarts: Count | None = Field(default=None, description="Attempts until the filter followed")
 
     def moves_without(self, trial: str) -> dict[str, float]:
@@ -324,8 +294,6 @@ class IdentifyResult(Result, file="models/{model}/identify.json", stage="identif
         """Inertial numbers of a robot's bodies: motion determines only combinations of them."""
         return frozenset(name for base in self.base_parameters or () for name in base.members)
 
-    repeats: Count | None = Field(
-        default=None,
-        description="Further runs of the filter around its answer; the states are of the last "
-        "run, the trace of the first and the last",
-    )
+    repeats: Count | None = None
+    """Further runs of the filter around its answer; the states are of the last run, the trace of
+    the first and the last"""

@@ -14,9 +14,8 @@ class EncoderChannel(Record):
     unit: Literal["rad", "m"]
     resolution: Size = Field(description="Step of the encoder in that unit, as used")
     resolution_stated: Size | None = Field(description="From session.toml, or null")
-    resolution_measured: Size | None = Field(
-        description="Step of the readings; null without a grid"
-    )
+    resolution_measured: Size | None
+    """Step of the readings; null without a grid"""
     noise_sd: Size = Field(description="Standard deviation of a reading, rounding included")
     scale: float = Field(default=1.0, description="rad or m for one raw unit, by session.toml")
     zero: float = Field(default=0.0, description="Raw reading at position 0, by session.toml")
@@ -32,21 +31,17 @@ class ForceChannels(Record):
     unit: str
     noise_sd: dict[str, Size] = Field(description="Standard deviation by channel, as used")
     noise_sd_stated: Size | None = Field(description="From session.toml, or null")
-    noise_sd_measured: dict[str, Size | None] = Field(
-        description="By channel; null if too little is recorded"
-    )
-    calibration: tuple[tuple[float, ...], ...] = Field(
-        default=(), description="One row per component: `unit` per raw unit of each column"
-    )
+    noise_sd_measured: dict[str, Size | None]
+    """By channel; null if too little is recorded"""
+    calibration: tuple[tuple[float, ...], ...] = ()
+    """One row per component: `unit` per raw unit of each column"""
     zero: tuple[float, ...] = Field(default=(), description="Raw readings without force")
     raw_unit: str = Field(default="", description="Unit of the raw columns")
     gain_sd: Size = Field(default=0.0, description="Standard uncertainty of each gain, as a share")
-    crosstalk_sd: Size = Field(
-        default=0.0, description="Standard uncertainty of the crosstalk between components, a share"
-    )
-    look_like_counts: Names = Field(
-        default=(), description="Channels whose readings look like counts of a converter"
-    )
+    crosstalk_sd: Size = 0.0
+    """Standard uncertainty of the crosstalk between components, a share"""
+    look_like_counts: Names = ()
+    """Channels whose readings look like counts of a converter"""
 
 
 class RecordedChannel(Record):
@@ -57,9 +52,8 @@ class RecordedChannel(Record):
     offset: float = 0.0
     raw_unit: str = Field(default="", description="Unit of the column if it is not rescaled")
     scale_sd: Size = Field(default=0.0, description="Standard uncertainty of scale, as a share")
-    second_encoder_of: str = Field(
-        default="", description="Axis whose position it reads on the other side of the gear"
-    )
+    second_encoder_of: str = ""
+    """Axis whose position it reads on the other side of the gear"""
 
 
 class MainsHum(Record):
@@ -89,9 +83,8 @@ class IngestResult(Result, file="ingest/session.json", stage="ingest"):
     device: str = Field(min_length=1)
     device_file: str | None = Field(description="The session's own; null for a built-in device")
     driven: bool = Field(default=False, description="Whether a motor drives the device, not a hand")
-    default_effects: Names = Field(
-        default=(), description="Effects that the device file gives the base model"
-    )
+    default_effects: Names = ()
+    """Effects that the device file gives the base model"""
     placeholders: Names = Field(default=(), description="Numbers whose source still says `fill in`")
     recorded_at: str | None = Field(description="ISO 8601, or null")
     operator: str = Field(default="", description="Who recorded it")
@@ -103,13 +96,11 @@ class IngestResult(Result, file="ingest/session.json", stage="ingest"):
     kept_every: int = Field(default=1, ge=1, description="One sample of a log in this many is kept")
     axes: dict[str, EncoderChannel] = Field(min_length=1)
     force: ForceChannels
-    sensor_warnings: Names = Field(
-        description="Stated noise or resolution that differs from the measured one by more than a"
-        " factor of two; readings that look like counts"
-    )
+    sensor_warnings: Names
+    """Stated noise or resolution that differs from the measured one by more than a factor of two;
+    readings that look like counts"""
     mains_hum: tuple[MainsHum, ...] = ()
     brakes: dict[str, RecordedChannel]
     channels: dict[str, RecordedChannel]
-    dead: dict[str, tuple[DeadStretch, ...]] = Field(
-        default_factory=dict, description="By trial: stretches with a dead sensor"
-    )
+    dead: dict[str, tuple[DeadStretch, ...]] = Field(default_factory=dict)
+    """By trial: stretches with a dead sensor"""

@@ -35,15 +35,13 @@ class ControlChart(Record):
     name: str
     unit: str
     centre: float = Field(description="Median")
-    between_sd: Size | None = Field(
-        description="Scatter between sessions, without the uncertainty within them"
-    )
+    between_sd: Size | None
+    """Scatter between sessions, without the uncertainty within them"""
     slope_per_session: float | None
     slope_p: Share | None
     drifts: bool
-    run: tuple[str, str] | None = Field(
-        description="First and last session of a run on one side of the centre, or null"
-    )
+    run: tuple[str, str] | None
+    """First and last session of a run on one side of the centre, or null"""
     points: tuple[ChartPoint, ...]
 
     @property
@@ -74,9 +72,8 @@ class SessionVerdict(Record):
     effects: Names
     unexplained: Names = Field(description="Axes on which something unknown is missing")
     diagnosed: bool
-    worst: tuple[float, str] | None = Field(
-        description="Largest held-out error of that model over its floor, and its axis; or null"
-    )
+    worst: tuple[float, str] | None
+    """Largest held-out error of that model over its floor, and its axis; or null"""
     above_floor: bool = Field(description="Whether that model is above its floor on some axis")
     sentence: str
     remedy: str

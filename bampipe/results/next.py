@@ -71,9 +71,8 @@ class ExpectedConfusion(PlannedConfusion):
     """The same with one new trial, and its errors."""
 
     weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")
-    left: dict[str, Size] = Field(
-        description="By axis: error on the new trial of the wrong one refitted, over the noise"
-    )
+    left: dict[str, Size]
+    """By axis: error on the new trial of the wrong one refitted, over the noise"""
 
 
 class Proposal(Record):
@@ -89,10 +88,8 @@ class Proposal(Record):
     levels: dict[str, float] = Field(default={}, description="Of further channels")
     worth: float = Field(description="Utility that ranks proposals: nine in ten versions reach it")
     information_gain: float = Field(description="Half the drop of the log determinant, nats")
-    sd: dict[str, ExpectedSd] = Field(
-        default={},
-        description="By parameter; none if the model lacks something or is not fitted to it",
-    )
+    sd: dict[str, ExpectedSd] = Field(default={})
+    """By parameter; none if the model lacks something or is not fitted to it"""
     confusion: tuple[ExpectedConfusion, ...] = ()
     farther: Names = Field(default=(), description="Axes moved farther than in the present trials")
     faster: Names = Field(default=(), description="Axes moved faster than in the present trials")
@@ -125,9 +122,8 @@ class Trajectory(Record):
     file: str = Field(description="Path in the run folder")
     seconds: Size
     limits: dict[str, Extent] = Field(description="By axis")
-    assumed: Names = Field(
-        description="Axes without a stated acceleration: their limit is the highest seen"
-    )
+    assumed: Names
+    """Axes without a stated acceleration: their limit is the highest seen"""
     used: dict[str, Extent] = Field(description="By axis; effort is the model's forecast")
 
 
@@ -153,9 +149,8 @@ class Plan(Record):
     seconds: Size = Field(description="Of all trials")
     is_enough: bool = Field(description="Whether the limit is expected to be reached")
     trials: tuple[PlannedTrial, ...]
-    sd: dict[str, PlannedSd] = Field(
-        default={}, description="By parameter; none if the model lacks something"
-    )
+    sd: dict[str, PlannedSd] = Field(default={})
+    """By parameter; none if the model lacks something"""
     confusion: tuple[PlannedConfusion, ...] = ()
 
 
@@ -174,12 +169,9 @@ class NextResult(Result, file="models/{model}/next.json", stage="next"):
     expected: str = Field(description="Its expected result")
     proposals: tuple[Proposal, ...] = Field(description="Best first")
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
-    unpromised: Names = Field(
-        default=(), description="Effects that change the motion too much for such a number"
-    )
-    shows: Names = Field(
-        default=(),
-        description="Effects that the first proposal would reveal, unlike the present trials",
-    )
+    unpromised: Names = ()
+    """Effects that change the motion too much for such a number"""
+    shows: Names = ()
+    """Effects that the first proposal would reveal, unlike the present trials"""
     plan: Plan | None = None
     trajectory: Trajectory | None = None

@@ -52,10 +52,9 @@ class Travel(Record):
     own_error: Size = Field(description="Held-out error of the model of the trials' own session")
     noise_floor: Size | None
     uncertainty: Size = Field(description="Part of the error that the parameters' sd accounts for")
-    limit: Size = Field(
-        description="Largest error of a model that travels, from the floor there, or from"
-        " own_error if the model is above the floor of its own session"
-    )
+    limit: Size
+    """Largest error of a model that travels, from the floor there, or from own_error if the model
+    is above the floor of its own session"""
     unit: str
     travels: bool
 
@@ -76,14 +75,11 @@ class Journey(Record):
     effects: Names = Field(description="Of the model")
     axes: dict[str, Travel]
     alone: tuple[Refit, ...] = Field(default=(), description="Single parameters, best first")
-    together: Refit | None = Field(
-        default=None, description="Parameters added one at a time, the most useful first"
-    )
-    lacking: dict[str, AxisVerdict] = Field(
-        default={},
-        description="By axis: verdict on a model with the same effects in the other session, where"
-        " no refit reaches the limit or the own model is above its floor",
-    )
+    together: Refit | None = None
+    """Parameters added one at a time, the most useful first"""
+    lacking: dict[str, AxisVerdict] = Field(default={})
+    """By axis: verdict on a model with the same effects in the other session, where no refit
+    reaches the limit or the own model is above its floor"""
     reason: str = Field(default="", description="Reason why these are not known")
 
     @property

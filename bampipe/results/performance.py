@@ -41,9 +41,8 @@ class Handle(Record):
 
     directions: Names
     workspace: Quantity = Field(description="Swept in the session")
-    workspace_limits: Quantity | None = Field(
-        default=None, description="Within the limits of the device file"
-    )
+    workspace_limits: Quantity | None = None
+    """Within the limits of the device file"""
     stiffness: Range | None = None
     friction: Range
     inertia: Range
@@ -57,7 +56,6 @@ class PerformanceResult(Result, file="models/{model}/performance.json", stage="p
     constants: dict[str, DeviceConstant]
     range: dict[str, Range] = Field(min_length=1, description="By axis, over the moving trials")
     resolution: dict[str, Resolution] = Field(description="By axis")
-    largest_force: Quantity | None = Field(
-        description="Largest that the sensor read (99.9 % quantile); null where there is none"
-    )
+    largest_force: Quantity | None
+    """Largest that the sensor read (99.9 % quantile); null where there is none"""
     handle: Handle | None = None

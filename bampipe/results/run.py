@@ -115,9 +115,8 @@ class RunResult(Result, file="run.json", stage="run"):
     stages: dict[str, StepRecord] = Field(description="By step: <stage>, or <stage>:<model>")
     timings: dict[str, Timing] = Field(default={})
     failures: dict[str, str] = Field(default={}, description="By step: fault of its last attempt")
-    versions: dict[str, str] = Field(
-        default={}, description="Of Python, bampipe and its dependencies, at the last run"
-    )
+    versions: dict[str, str] = Field(default={})
+    """Of Python, bampipe and its dependencies, at the last run"""
     gates: tuple[GateVerdict, ...] = ()
 
 

@@ -16,9 +16,8 @@ class PossibleMistake(Record):
     """One mistake in a session or device file."""
 
     kind: Kind
-    signals: Names = Field(
-        description="Axes, force channels and other channels concerned; none for a clock or gravity"
-    )
+    signals: Names
+    """Axes, force channels and other channels concerned; none for a clock or gravity"""
     sentence: str = Field(description="The mistake and its correction")
 
 
@@ -27,28 +26,24 @@ class SetupMistake(PossibleMistake):
 
     factor: float = Field(default=1.0, description="Correcting factor of a scale or clock")
     offset: float = Field(default=0.0, description="Correction of a zero, rad or m")
-    gravity: tuple[float, float, float] | None = Field(
-        default=None, description="Corrected gravity in the frame of a robot's base, m/s2"
-    )
+    gravity: tuple[float, float, float] | None = None
+    """Corrected gravity in the frame of a robot's base, m/s2"""
     axes: Names = Field(description="Whose equations it spoils")
     evidence: str = Field(description="The change after its correction")
-    error_before: dict[str, Size] = Field(
-        description="Error of the fit by axis, per cent of the applied force"
-    )
+    error_before: dict[str, Size]
+    """Error of the fit by axis, per cent of the applied force"""
     error_after: dict[str, Size] = Field(description="The same after its correction")
-    alternatives: tuple[PossibleMistake, ...] = Field(
-        default=(), description="Other mistakes that the trials cannot distinguish from this one"
-    )
+    alternatives: tuple[PossibleMistake, ...] = ()
+    """Other mistakes that the trials cannot distinguish from this one"""
 
 
 class AxisSetup(Record):
     """The state of the set-up of one axis."""
 
     state: AxisState
-    error_percent: Size | None = Field(
-        description="Error of the bare device fitted by least squares, per cent of the applied"
-        " force; null without applied force, or if the axis hardly moves"
-    )
+    error_percent: Size | None
+    """Error of the bare device fitted by least squares, per cent of the applied force; null without
+    applied force, or if the axis hardly moves"""
     moving_share: Share = Field(description="Share of the samples in which the axis moves")
 
 

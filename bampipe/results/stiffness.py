@@ -35,9 +35,8 @@ class LockedTrial(Record):
     stiffness: Positive
     standard_error: Size
     transition: float = Field(description="Torque after a reversal at which the loop is post-yield")
-    slope_change: float = Field(
-        description="Stiffness of the first half of the post-yield part over the second, less 1"
-    )
+    slope_change: float
+    """Stiffness of the first half of the post-yield part over the second, less 1"""
     drift: float = Field(description="Drift of the loops from first to last, share of their range")
 
 
@@ -45,18 +44,14 @@ class AxisStiffness(Record):
     """Stiffness of one axis over its locked trials."""
 
     stiffness: Positive
-    sd: Size = Field(
-        description="Standard uncertainty: standard_error, systematic and calibration_sd together"
-    )
-    standard_error: Size = Field(
-        description="By the scatter over cycles or by the regression over all, whichever is larger"
-    )
-    systematic: Size = Field(
-        description="A quarter of the change of slope, measured or possible, over the straight part"
-    )
-    calibration_sd: Size = Field(
-        description="Part from the stated uncertainties of sensors, and the zeros of encoders"
-    )
+    sd: Size
+    """Standard uncertainty: standard_error, systematic and calibration_sd together"""
+    standard_error: Size
+    """By the scatter over cycles or by the regression over all, whichever is larger"""
+    systematic: Size
+    """A quarter of the change of slope, measured or possible, over the straight part"""
+    calibration_sd: Size
+    """Part from the stated uncertainties of sensors, and the zeros of encoders"""
     unit: str = Field(description="Of the stiffness: N.m/rad or N/m")
     n_cycles: int = Field(ge=1)
     bandwidth_rad_s: Positive = Field(description="sqrt(stiffness / inertia) at bandwidth_pose")
@@ -78,24 +73,20 @@ class AxisStiffness(Record):
 class GearStiffness(Record):
     """Stiffness of a gear with an encoder on either side, over the free trials."""
 
-    stiffness: Positive | None = Field(
-        description="Null if the difference of the encoders does not follow the load"
-    )
+    stiffness: Positive | None
+    """Null if the difference of the encoders does not follow the load"""
     sd: Size | None = Field(description="Standard uncertainty, by the scatter of stretches")
     unit: str = Field(description="Of the stiffness: N.m/rad or N/m")
-    play: float | None = Field(
-        description="Gap that the gear crosses as the load changes sign, rad or m; null if it"
-        " never does"
-    )
+    play: float | None
+    """Gap that the gear crosses as the load changes sign, rad or m; null if it never does"""
     play_sd: Size | None
     play_unit: str
     side: Literal["motor", "load"] = Field(description="Side of the second encoder")
     late_s: float = Field(description="Delay of the second encoder's reading after the first, s")
     late_sd: Size
-    explained: float = Field(
-        description="Share of the variance of the difference that stiffness and play explain, after"
-        " timing and the drive's own losses"
-    )
+    explained: float
+    """Share of the variance of the difference that stiffness and play explain, after timing and the
+    drive's own losses"""
     channel: str = Field(description="Of the second encoder")
 
 
@@ -104,9 +95,7 @@ class StiffnessResult(Result, file="stiffness/stiffness.json", stage="stiffness"
 
     headline: str
     notes: Names = Field(description="Trials without loops, slipping brakes, small loads")
-    axes: dict[str, AxisStiffness] = Field(
-        description="One entry for each axis with a locked trial"
-    )
-    gears: dict[str, GearStiffness] = Field(
-        default={}, description="By axis with a second encoder; see channels.second_encoder_of"
-    )
+    axes: dict[str, AxisStiffness]
+    """One entry for each axis with a locked trial"""
+    gears: dict[str, GearStiffness] = Field(default={})
+    """By axis with a second encoder; see channels.second_encoder_of"""

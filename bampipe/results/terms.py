@@ -42,7 +42,6 @@ class TermsResult(Result, file="models/{model}/terms.json", stage="validate"):
     """The equations of a model, and the force of each of its terms."""
 
     model: str
-    equations: Names = Field(
-        description="Lines of M q'' + h = Q with identified numbers; may be empty"
-    )
+    equations: Names
+    """Lines of M q'' + h = Q with identified numbers; may be empty"""
     terms: tuple[ModelTerm, ...]

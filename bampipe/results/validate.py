@@ -16,9 +16,8 @@ class AxisError(Record):
     rmse_without_friction: Size
     held_out_rmse: Size = Field(description="Each trial by the estimate without it")
     relative_error_percent: Size = Field(description="100 rmse / RMS of the measured torque")
-    held_out_relative_error_percent: Size = Field(
-        description="100 held_out_rmse / root mean square of the measured torque"
-    )
+    held_out_relative_error_percent: Size
+    """100 held_out_rmse / root mean square of the measured torque"""
     fit_percent: Annotated[float, Field(le=100)] | None = Field(
         description="100 (1 - held_out_rmse / standard deviation of the measured torque); null on"
         " an undriven axis"
@@ -29,10 +28,9 @@ class AxisError(Record):
 class JudgedError(AxisError):
     """Error of one axis over all trials, compared with its noise floor."""
 
-    noise_floor: Size | None = Field(
-        description="Error of the fitted model's own replicates with the same sensors and"
-        " filters; null if none was computed"
-    )
+    noise_floor: Size | None
+    """Error of the fitted model's own replicates with the same sensors and filters; null if none
+    was computed"""
     noise_floor_sd: Size = Field(description="Scatter of one replicate")
     standing: FloorStatus
 
@@ -99,12 +97,10 @@ class FreeRun(Record):
     mode: Literal["closed_loop", "open_loop"] | None = None
     axes: dict[str, FreeRunError] = Field(default={})
     trials: dict[str, dict[str, FreeRunError]] = Field(default={})
-    forces: dict[str, CommandError] = Field(
-        default={}, description="Commanded force channels, closed loop"
-    )
-    drift: dict[str, AxisDrift] = Field(
-        default={}, description="By axis: short free runs from many starts of each trial"
-    )
+    forces: dict[str, CommandError] = Field(default={})
+    """Commanded force channels, closed loop"""
+    drift: dict[str, AxisDrift] = Field(default={})
+    """By axis: short free runs from many starts of each trial"""
 
 
 class ValidateResult(Result, file="models/{model}/validate.json", stage="validate"):
@@ -116,11 +112,9 @@ class ValidateResult(Result, file="models/{model}/validate.json", stage="validat
     floor_replays: Count = Field(description="Replicates over which the noise floor is a mean")
     failed_checks: Names = Field(description="Of data, estimate and floor; empty for a sound model")
     notes: Names
-    axes: dict[str, JudgedError] = Field(
-        description="Over all free trials and those in a viscous field, stretches at rest left out"
-    )
+    axes: dict[str, JudgedError]
+    """Over all free trials and those in a viscous field, stretches at rest left out"""
     trials: dict[str, TrialError]
-    forces: dict[str, ForceError] = Field(
-        description="Handle force by component, identified parameters"
-    )
+    forces: dict[str, ForceError]
+    """Handle force by component, identified parameters"""
     free_run: FreeRun | None = None

@@ -15,9 +15,8 @@ class Damping(Record):
     own_friction: float = Field(description="The device's own viscous friction, as felt there")
     felt: float = Field(description="Both together")
     unit: Literal["N.s/m"]
-    commanded: float | None = Field(
-        default=None, description="null if it is not recorded, as are the following"
-    )
+    commanded: float | None = None
+    """null if it is not recorded, as are the following"""
     p_value: Share | None = None
     differs: bool | None = None
     felt_p_value: Share | None = None
@@ -31,14 +30,9 @@ class ViscousResult(Result, file="models/{model}/viscous.json", stage="viscous")
     model: str
     headline: str
     trials: Names
-    blocks: Annotated[int, Field(ge=1)] | None = Field(
-        default=None,
-        description="Number of stretches of time whose scatter gives the standard deviations",
-    )
-    process_noise_factor: Annotated[float, Field(ge=1)] | None = Field(
-        default=None,
-        description="Factor on the filter's process noise that was needed; usually 1",
-    )
-    directions: dict[str, Damping] = Field(
-        description="By component of the handle's force; empty without viscous trials"
-    )
+    blocks: Annotated[int, Field(ge=1)] | None = None
+    """Number of stretches of time whose scatter gives the standard deviations"""
+    process_noise_factor: Annotated[float, Field(ge=1)] | None = None
+    """Factor on the filter's process noise that was needed; usually 1"""
+    directions: dict[str, Damping]
+    """By component of the handle's force; empty without viscous trials"""

@@ -41,8 +41,8 @@ def read(folder: Path, device: str) -> Accepted | None:
     try:
         return check(Accepted, read_json(path), str(path))
     except InputError as error:
-        remedy = error.remedy or "restore it, or accept anew"
-        raise InputError(error.what, where=error.where, remedy=remedy) from error
+        error.remedy = error.remedy or "restore it, or accept anew"
+        raise
 
 
 def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
@@ -69,21 +69,14 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
             remedy="accept it all the same with --force",
         )
     session = run.read(IngestResult)
-    results: dict[str, dict[str, dict[str, dict[str, object]]]] = {
-        IdentifyResult.FILE: {
-            "parameters": {
-                name: found.model_dump(include={"estimate", "sd", "unit"})
-                for name, found in run.read(IdentifyResult, model).parameters.items()
-            }
-        }
-    }
+    shown: set[str] = {"estimate", "sd", "unit"}
+    estimates = run.read(IdentifyResult, model).parameters
+    kept = {name: found.model_dump(include=shown) for name, found in estimates.items()}
+    results = {IdentifyResult.FILE: {"parameters": kept}}
     if stiffness := run.find(StiffnessResult):
-        results[StiffnessResult.FILE] = {
-            "axes": {
-                axis: found.model_dump(include={"stiffness", "sd", "unit"})
-                for axis, found in stiffness.axes.items()
-            }
-        }
+        shown = {"stiffness", "sd", "unit"}
+        kept = {axis: one.model_dump(include=shown) for axis, one in stiffness.axes.items()}
+        results[StiffnessResult.FILE] = {"axes": kept}
     path = file_of(folder, session.device)
     content = Accepted(
         device=session.device,

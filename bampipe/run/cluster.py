@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent import futures
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from bampipe.errors import InputError
@@ -23,7 +22,7 @@ from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.request import Outcome, Request
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client
 
 PATIENCE_S = 10.0
 """Time for which a scheduler may be silent or without workers."""
@@ -43,20 +42,17 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
     Raises:
         InputError: Dask is not installed, the scheduler does not answer, or has no workers.
     """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise InputError(
-            "--engine dask needs Dask", remedy="pip install 'bampipe[dask]'"
-        ) from error
+    from bampipe.data.readers.trial import need
+
+    distributed = need("distributed", "dask")
     # Lost connections are reported once, below, not by Dask's log.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    client = _connect(scheduler) if scheduler else Client(threads_per_worker=1)
+    client = _connect(scheduler) if scheduler else distributed.Client(threads_per_worker=1)
     outcomes: dict[int, Outcome] = {}
     lost = ""
     try:
         tasks = {
-            client.submit(guarded, _placed(request), ignore_event, pure=False): number
+            client.submit(guarded, _place(request), ignore_event, pure=False): number
             for number, request in enumerate(requests)
         }
         watch = _Watch(client)
@@ -67,7 +63,11 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
                 if task.status in ("cancelled", "lost"):
                     lost = "the Dask scheduler was lost"
                     continue
-                outcomes[number] = _outcome(task, root=root)
+                try:
+                    outcomes[number] = replace(task.result(), root=root)
+                except Exception as error:  # the worker could not start the task
+                    text = f"its worker failed: {type(error).__name__}: {error}"
+                    outcomes[number] = Outcome(root, "crashed", error=text)
                 listen(Event(root.name, "", "done", 1.0))
             lost = lost or watch.fault()
             time.sleep(0.0 if lost or not tasks else 0.05)
@@ -145,21 +145,11 @@ class _Watch:
         return ""
 
 
-def _outcome(task: Future[Outcome], root: Path) -> Outcome:
-    """Return the outcome of a finished task; a task that its worker could not start has crashed."""
-    try:
-        found: Outcome = task.result()
-        return replace(found, root=root)
-    except Exception as error:
-        return Outcome(root, "crashed", error=f"its worker failed: {type(error).__name__}: {error}")
-
-
-def _placed(request: Request) -> Request:
+def _place(request: Request) -> Request:
     """Return the request as a worker needs it: absolute paths, and no processes of its own.
 
     A Dask worker is a daemon, which may have no children; its cores are used by other sessions.
     """
-    session = None if request.session is None else request.session.resolve()
-    accepted = None if request.accepted is None else request.accepted.resolve()
-    root = request.root.resolve()
-    return replace(request, root=root, session=session, accepted=accepted, processes=1)
+    given = {name: getattr(request, name) for name in ("root", "session", "accepted")}
+    placed = {name: path.resolve() for name, path in given.items() if path is not None}
+    return replace(request, **placed, processes=1)

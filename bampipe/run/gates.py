@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.pipeline import Gate
@@ -70,9 +69,9 @@ def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[Gate
 
 def _judge_result(gate: Gate, root: Path, model: str) -> list[GateVerdict]:
     relative = gate.result.replace("{model}", model)
-    content = _content(root / relative)
-    if content is None:
+    if not (root / relative).is_file():
         return [_missing(gate, "", f"there is no {relative}")]
+    content = read_json_table(root / relative)
     values = _pick(content, gate.value)
     divisors = _pick(content, gate.divide_by) if gate.divide_by else {}
     words = _pick(content, gate.judged_by) if gate.judged_by else {}
@@ -107,10 +106,6 @@ def _judge_result(gate: Gate, root: Path, model: str) -> list[GateVerdict]:
     return verdicts
 
 
-def _content(path: Path) -> dict[str, Any] | None:
-    return read_json_table(path) if path.is_file() else None
-
-
 def _judge_change(
     gate: Gate, root: Path, model: str, baseline: Path
 ) -> tuple[str, list[GateVerdict]]:
@@ -123,7 +118,8 @@ def _judge_change(
         what = f"nothing accepted yet in {baseline}: run `bampipe accept`"
         return model, [_missing(gate, "", what)]
     model = reference.model
-    content = _content(root / gate.result.replace("{model}", model))
+    path = root / gate.result.replace("{model}", model)
+    content = read_json_table(path) if path.is_file() else None
     if content is None and "{model}" in gate.result:
         what = f"the accepted values are those of model {model!r}, which this run does not have"
         found = _missing(gate, "", what)
@@ -133,14 +129,13 @@ def _judge_change(
     now, before = _pick(content, gate.value), _pick(old, gate.value)
     sds, old_sds = (_pick(of, f"{parent}.sd") for of in (content, old))
     verdicts = []
-    for key in [*now, *(key for key in before if key not in now)]:
+    for key in now | before:
         value, accepted_value = _number(now.get(key)), _number(before.get(key))
-        if value is None or accepted_value is None:
-            where = "this run" if value is None else "the accepted values"
-            verdicts.append(_missing(gate, key, f"no {last} in {where}"))
-            continue
-        if accepted_value == 0.0:
-            verdicts.append(_missing(gate, key, "the accepted value is 0: no change in percent"))
+        if value is None or not accepted_value:
+            what = f"no {last} in {'this run' if value is None else 'the accepted values'}"
+            if value is not None and accepted_value == 0.0:
+                what = "the accepted value is 0: no change in percent"
+            verdicts.append(_missing(gate, key, what))
             continue
         scale = 100.0 / abs(accepted_value)
         change = scale * (value - accepted_value)

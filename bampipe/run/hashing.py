@@ -20,7 +20,6 @@ PACKAGES = (
     "numpy",
     "pandas",
     "pyarrow",
-    "scikit-learn",
     "scipy",
     "sympy",
     "typst",
@@ -111,10 +110,5 @@ def digest_code(stage: str) -> str:
 @cache
 def versions() -> Mapping[str, str]:
     """Return the version of bampipe, of Python and of every package that may change a result."""
-    found = {"bampipe": bampipe.__version__, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = ABSENT
-    return found
+    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {"bampipe": bampipe.__version__, "python": platform.python_version(), **found}

@@ -3,26 +3,12 @@
 import contextlib
 import os
 import platform
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from filelock import lock_descriptor
+from filelock import FileLock, Timeout
 
 from bampipe.errors import InputError
-
-_held: set[int] = set()
-
-
-def _close_in_child() -> None:
-    # A lock belongs to the open file. A forked worker shares that, and would keep the lock alive.
-    for handle in _held:
-        os.close(handle)
-    _held.clear()
-
-
-if hasattr(os, "register_at_fork"):  # nothing is forked on Windows
-    os.register_at_fork(after_in_child=_close_in_child)
 
 
 @contextlib.contextmanager
@@ -43,42 +29,33 @@ def hold(
         InputError: another process holds it and ``wait`` is false.
         OSError: the file cannot be made.
     """
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-    _held.add(handle)
+    lock = FileLock(path, poll_interval=0.1, fallback_to_soft=False)
     try:
-        if not lock_descriptor(handle, blocking=False):
-            if not wait:
-                raise InputError(
-                    f"another bampipe is at work here, {_name(handle)}".rstrip(", "),
-                    where=str(path),
-                    remedy="wait until it is done, or leave out --no-wait",
-                )
-            waiting(_name(handle))
-            while not lock_descriptor(handle, blocking=False):
-                time.sleep(0.1)
-        left = _name(handle)
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        if not wait:
+            raise InputError(
+                f"another bampipe is at work here, {_read_holder(path)}".rstrip(", "),
+                where=str(path),
+                remedy="wait until it is done, or leave out --no-wait",
+            ) from error
+        waiting(_read_holder(path))
+        lock.acquire()
+    try:
+        left = _read_holder(path)
         if left:
             taking_over(left)
-        _write_name(handle, f"process {os.getpid()} on {platform.node()}")
-        try:
-            yield
-        finally:
-            _write_name(handle, "")
+        with contextlib.suppress(OSError):  # on a full disk, the lock holds without a name
+            path.write_text(f"process {os.getpid()} on {platform.node()}")
+        yield
     finally:
-        _held.discard(handle)
-        os.close(handle)
+        with contextlib.suppress(OSError):
+            path.write_text("")
+        lock.release()
 
 
-def _write_name(handle: int, name: str) -> None:
-    with contextlib.suppress(OSError):  # on a full disk, the lock holds without a name
-        os.ftruncate(handle, 0)
-        os.lseek(handle, 0, os.SEEK_SET)
-        os.write(handle, name.encode())
-
-
-def _name(handle: int) -> str:
-    os.lseek(handle, 0, os.SEEK_SET)
+def _read_holder(path: Path) -> str:
     try:
-        return os.read(handle, 200).decode(errors="replace")
+        return path.read_text(errors="replace")[:200]
     except PermissionError:  # Windows reserves locked bytes for their holder
         return ""

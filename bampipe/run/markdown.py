@@ -16,25 +16,18 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     """Return the summary of a run as GitHub-flavoured Markdown."""
     codes = [outcome.exit_code for outcome in outcomes]
     lines = [f"## bampipe: {_headline(codes)}", ""]
-    lines += _table(
-        ("session", "result", "model", "error / floor", "what"),
-        [_session(outcome) for outcome in outcomes],
-    )
+    head = ("session", "result", "model", "error / floor", "what")
+    lines += _table(head, list(map(_session, outcomes)))
     marked = [
-        (outcome.root.name, verdict)
+        (outcome.root.name, one.gate, one.key, one.state, one.message)
         for outcome in outcomes
-        for verdict in outcome.verdicts
-        if verdict.state in ("failed", "warned")
+        for one in outcome.verdicts
+        if one.state in ("failed", "warned")
     ]
     if marked:
         lines += ["", "### Gates that did not pass", ""]
-        lines += _table(
-            ("session", "gate", "", "verdict", ""),
-            [
-                (name, verdict.gate, verdict.key, verdict.state, verdict.message)
-                for name, verdict in sorted(marked, key=lambda one: one[1].state)
-            ],
-        )
+        head = ("session", "gate", "", "verdict", "")
+        lines += _table(head, sorted(marked, key=lambda row: row[3]))
     return "\n".join(lines) + "\n"
 
 
@@ -53,13 +46,9 @@ def _session(outcome: Outcome) -> tuple[str, ...]:
         return outcome.root.name, STATES[outcome.exit_code], "", "", outcome.error
     states = [verdict.state for verdict in outcome.verdicts]
     counts = [f"{states.count(one)} {one}" for one in ("failed", "warned") if one in states]
-    return (
-        outcome.root.name,
-        STATES[outcome.exit_code],
-        outcome.model,
-        _errors(RunFolder(outcome.root), outcome.model),
-        f"gates: {', '.join(counts)}" if counts else "",
-    )
+    gates = f"gates: {', '.join(counts)}" if counts else ""
+    errors = _errors(RunFolder(outcome.root), outcome.model)
+    return outcome.root.name, STATES[outcome.exit_code], outcome.model, errors, gates
 
 
 def _errors(run: RunFolder, model: str) -> str:

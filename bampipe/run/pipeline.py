@@ -42,21 +42,15 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in find_shipped("pipelines").glob("*.toml")))
 
 
-def find(name: str) -> Path:
-    """Return the file of the pipeline ``name``: a shipped one, or a path to a lab's own."""
-    if name.endswith(".toml"):
-        path = Path(name)
-        if path.is_file():
-            return path
-        raise InputError("no such pipeline file", where=name)
-    if name in names():
-        return find_shipped("pipelines") / f"{name}.toml"
-    raise InputError(f"no pipeline {name!r}", remedy=choose_from(name, names()))
-
-
 def load(name: str = "default") -> Pipeline:
-    """Read and check the pipeline ``name`` (see :func:`find`)."""
-    path = find(name)
+    """Read and check the pipeline ``name``: a shipped one, or the path to a lab's own."""
+    path = Path(name)
+    if not name.endswith(".toml"):
+        if name not in names():
+            raise InputError(f"no pipeline {name!r}", remedy=choose_from(name, names()))
+        path = find_shipped("pipelines") / f"{name}.toml"
+    elif not path.is_file():
+        raise InputError("no such pipeline file", where=name)
     pipeline = read(Pipeline, read_toml(path), str(path))
     pipeline._where = str(path)
     return pipeline

@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import digest_content, digest_file, json_text, parse_json
 from bampipe.results.run import PRIVATE, Published
@@ -37,11 +38,8 @@ def publish(root: Path, url: str) -> str:
     Args:
         url: a folder as fsspec names it, such as ``s3://bucket/runs`` or ``file:///mnt/runs``.
     """
-    files = {
-        path.relative_to(root).as_posix(): path
-        for path in sorted(root.rglob("*"))
-        if path.is_file() and path.relative_to(root).parts[0] != PRIVATE
-    }
+    names = RunFolder(root).glob("**/*")
+    files = {name: root / name for name in names if name.partition("/")[0] != PRIVATE}
     hashes = {name: digest_file(path) for name, path in files.items()}
     version = digest_content(hashes)[:16]
     system, base = open_place(url)
@@ -121,14 +119,11 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
 
 def open_place(url: str) -> tuple[Any, str]:
     """Return the file system and the path on it; an impossible place raises `InputError`."""
-    try:
-        from fsspec.core import url_to_fs
-    except ImportError as error:
-        raise InputError(
-            "publishing and fetching need fsspec", remedy="pip install 'bampipe[remote]'"
-        ) from error
+    from bampipe.data.readers.trial import need
+
+    fsspec = need("fsspec.core", "remote")
     with _driver("no such file system", url):
-        system, path = url_to_fs(url)
+        system, path = fsspec.url_to_fs(url)
     return system, str(path).rstrip("/")
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from bampipe.errors import InputError
-from bampipe.files import STORAGE_FAULTS, digest_file, write_json
+from bampipe.files import STORAGE_FAULTS, digest_file
 from bampipe.results.run import PRIVATE, RunResult
 from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.lock import hold
@@ -55,11 +55,6 @@ def touched(root: Path, name: str, step: str) -> InputError:
     """Return the error for the result ``name``, which is not as ``step`` wrote it."""
     remedy = f"run `bampipe {step.partition(':')[0]}` again to rebuild it"
     return InputError(f"{name} was changed since {step} wrote it", where=str(root), remedy=remedy)
-
-
-def write(root: Path, content: RunResult) -> None:
-    """Write ``run.json`` in one step, so that it appears complete or not at all."""
-    write_json(root / FILE, content.model_dump(mode="json"))
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from bampipe.compile_ahead import compiling_ahead
 from bampipe.errors import InputError, MissingResultError, NothingToDoError
 from bampipe.files import write_json
-from bampipe.results.run import Commit, GateVerdict, StepRecord, Timing
+from bampipe.results.run import Commit, PipelineUsed, StepRecord, Timing
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.gates import judge_gates
@@ -114,15 +114,16 @@ class _Runner:
                     models.read(self.root, self.request.model)
             for step in self.state.steps(stage):
                 results.append(self.step(step))
-        verdicts: list[GateVerdict] = []
-        judged = ""
-        if self.request.judge:
-            judged = self.request.model or models.default_model(self.root)
-            baseline = self.request.accepted or accepted.accepted_folder(self.root.parent)
-            for gate in pipeline.gates:
-                verdicts += judge_gates(gate, self.root, judged, baseline)
-        self.state.close(verdicts)
-        return Outcome(self.root, "done", tuple(results), tuple(verdicts), model=judged)
+        if not self.request.judge:
+            self.state.save()
+            return Outcome(self.root, "done", tuple(results))
+        judged = self.request.model or models.default_model(self.root)
+        baseline = self.request.accepted or accepted.accepted_folder(self.root.parent)
+        found = (judge_gates(gate, self.root, judged, baseline) for gate in pipeline.gates)
+        verdicts = tuple(verdict for of_gate in found for verdict in of_gate)
+        used = PipelineUsed.model_validate(pipeline.content())
+        self.state.save(pipeline=used, gates=verdicts)
+        return Outcome(self.root, "done", tuple(results), verdicts, model=judged)
 
 
 def run_session(request: Request, listen: Listener = ignore_event) -> Outcome:

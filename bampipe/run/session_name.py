@@ -27,23 +27,18 @@ def session_id(session: Path) -> str:
         ) from error
     path = session / "session.toml"
     if not path.is_file():
+        what, remedy = "no session.toml here", "give the folder of a session"
         if not session.exists():
-            raise InputError("no such session folder", where=str(session))
-        if session.is_dir() and any(session.glob("*/session.toml")):
-            raise InputError(
-                "this is a folder of sessions",
-                where=str(session),
-                remedy=f"give them one by one, or as '{session}/*'",
-            )
-        raise InputError(
-            "no session.toml here", where=str(session), remedy="give the folder of a session"
-        )
-    content = read_toml(path)
-    if "session_id" not in content:
+            what, remedy = "no such session folder", ""
+        elif session.is_dir() and any(session.glob("*/session.toml")):
+            what, remedy = "this is a folder of sessions", "give them one by one, or as "
+            remedy += f"'{session}/*'"
+        raise InputError(what, where=str(session), remedy=remedy)
+    name = read_toml(path).get("session_id")
+    if name is None:
         raise InputError(
             "'session_id' is missing", where=str(path), remedy="give the session a name of its own"
         )
-    name = content.get("session_id")
     if not isinstance(name, str) or not is_name(name):
         raise InputError(
             f"session_id must be a name of letters, digits, '.', '_', '+' or '-', not {name!r}",

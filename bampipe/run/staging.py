@@ -7,6 +7,7 @@ then on a kill loses nothing, since the next run repeats the moves of the commit
 import shutil
 from pathlib import Path
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import digest_file, is_inside, read_json_table
 from bampipe.results.run import PRIVATE, Commit
@@ -37,20 +38,15 @@ def prepare(root: Path, step: str, outputs: tuple[str, ...]) -> Path:
 
 def digest_outputs(staging: Path, declared: tuple[str, ...], step: str) -> dict[str, str]:
     """Hash the outputs of a stage, and compare them with its declaration."""
-    files = {
-        path.relative_to(staging).as_posix(): path
-        for path in sorted(staging.rglob("*"))
-        if path.is_file()
-    }
-    allowed: set[str] = set()
+    written, files = RunFolder(staging), RunFolder(staging).glob("**/*")
     for pattern in declared:
         if "*" not in pattern and pattern not in files:
             raise RuntimeError(f"stage {step} did not write {pattern}, which it declares")
-        allowed |= {path.relative_to(staging).as_posix() for path in staging.glob(pattern)}
-    undeclared = sorted(files.keys() - allowed)
+    allowed = {name for pattern in declared for name in written.glob(pattern)}
+    undeclared = sorted({*files} - allowed)
     if undeclared:
         raise RuntimeError(f"stage {step} wrote {undeclared[0]}, which it does not declare")
-    return {name: digest_file(path) for name, path in files.items()}
+    return {name: digest_file(staging / name) for name in files}
 
 
 def commit(state: RunState, staging: Path, sealed: Commit) -> None:
@@ -91,12 +87,10 @@ def _sealed(root: Path, staging: Path) -> Commit | None:
     except InputError:
         return None
     outputs = sealed.record.outputs
-    if folder(root, sealed.step) != staging:
-        return None
-    for name in (*outputs, *sealed.remove):
-        if not (is_inside(root, name) and is_inside(staging, name)) or (root / name).is_dir():
-            return None
-    for name, digest in outputs.items():
-        if (staging / name).is_file() and digest_file(staging / name) != digest:
-            return None
-    return sealed
+    is_sound = folder(root, sealed.step) == staging and all(
+        is_inside(root, name) and is_inside(staging, name) and not (root / name).is_dir()
+        for name in (*outputs, *sealed.remove)
+    )
+    files = {staging / name: digest for name, digest in outputs.items()} if is_sound else {}
+    intact = all(not f.is_file() or digest_file(f) == digest for f, digest in files.items())
+    return sealed if is_sound and intact else None

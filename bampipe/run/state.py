@@ -1,14 +1,14 @@
 """State of a run folder: its record, the dependencies of each step, and which must run again."""
 
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, MissingResultError
 from bampipe.files import digest_content, digest_file, digest_input
-from bampipe.results.run import SESSION, GateVerdict, PipelineUsed, RunResult
+from bampipe.results.run import SESSION
 from bampipe.run import hashing, models, record
 from bampipe.run.request import Request, Step
 from bampipe.run.settings import configure, list_lasting
@@ -65,9 +65,7 @@ class RunState:
         return self.session
 
     def configure(self, step: Step, settings: Mapping[str, object]) -> Any:
-        where = self.request.pipeline.where
-        if step.stage in self.request.settings:
-            where = ""
+        where = self.request.pipeline.where * (step.stage not in self.request.settings)
         if step.stage in base.READS_SESSION:
             settings = {**settings, "session": str(self.session_folder().resolve())}
         fields = base.load_stage(step.stage).Config.__dataclass_fields__
@@ -172,39 +170,22 @@ class RunState:
 
     # Storage
 
-    def save(self) -> None:
-        """Write ``run.json``."""
-        self._write(self._noted())
+    def save(self, **judged: object) -> None:
+        """Write ``run.json``, with what the gates ``judged``, unless it is unchanged.
 
-    def close(self, verdicts: Iterable[GateVerdict]) -> None:
-        """Write ``run.json`` with the verdicts of the gates, unless it is unchanged."""
-        noted = self._noted()
-        if self.request.judge:
-            used = PipelineUsed.model_validate(self.request.pipeline.content())
-            noted = noted.model_copy(update={"pipeline": used, "gates": tuple(verdicts)})
-        if noted != self.written:
-            self._write(noted)
-
-    def _noted(self) -> RunResult:
-        """Return the present record, with versions and machine as they were written."""
+        Versions and the machine are those of the last change.
+        """
         place = self.written.place
         if self.session is not None:
             place = place.model_copy(update={"session": str(self.session.resolve())})
-        return self.written.model_copy(
-            update={
-                "stages": dict(self.records),
-                "timings": dict(self.timings),
-                "failures": dict(self.failures),
-                "place": place,
-            }
-        )
-
-    def _write(self, noted: RunResult) -> None:
-        place = noted.place.model_copy(update={"machine": platform.platform()})
-        versions = dict(hashing.versions())
-        update = {"run": self.root.name, "versions": versions, "place": place}
-        self.written = noted.model_copy(update=update)
-        record.write(self.root, self.written)
+        tables = ("timings", "failures")
+        update = {name: dict(getattr(self, name)) for name in tables} | {"place": place, **judged}
+        noted = self.written.model_copy(update={"stages": dict(self.records), **update})
+        if noted != self.written:
+            place = place.model_copy(update={"machine": platform.platform()})
+            update = {"run": self.root.name, "versions": dict(hashing.versions()), "place": place}
+            self.written = noted.model_copy(update=update)
+            self.written.write(self.root)
 
 
 def _maker(name: str) -> str:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.files import digest_file, digest_input
 from bampipe.results.run import PRIVATE, SESSION
 from bampipe.run import hashing, record
@@ -31,21 +32,16 @@ def verify(root: Path) -> list[tuple[str, str]]:
                 elif held and digest(path) != written:
                     found.setdefault(name, "changed")
     place = content.place.session
-    for stage in base.READS_SESSION:
-        if stage not in content.stages:
-            continue
-        noted = content.stages[stage].inputs
+    for stage in {*base.READS_SESSION} & content.stages.keys():
         if place is None or not Path(place).is_dir():
             found["session"] = "gone"
             continue
-        now = hashing.digest_session(Path(place))
-        for name in sorted(noted.keys() | now.keys()):
+        noted, now = content.stages[stage].inputs, hashing.digest_session(Path(place))
+        for name in noted | now:
             if name.startswith(SESSION) and noted.get(name) != now.get(name):
                 gone = now.get(name) in (None, hashing.ABSENT)
                 found[name] = "gone" if gone else "changed"
-    for path in sorted(root.rglob("*")):
-        relative = path.relative_to(root)
-        private = relative.parts[0] == PRIVATE
-        if path.is_file() and not private and relative.as_posix() not in recorded:
-            found[relative.as_posix()] = "unknown"
+    for name in RunFolder(root).glob("**/*"):
+        if name.partition("/")[0] != PRIVATE and name not in recorded:
+            found[name] = "unknown"
     return sorted(found.items())

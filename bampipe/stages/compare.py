@@ -48,16 +48,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         )
     order = sorted(models, key=lambda n: (len(models[n].effects), n))
     ladder: dict[str, Rung] = {}
+    parameters: dict[str, dict[str, Value]] = {}
+    best = order[0]
     for name in order:
         ladder[name] = _rung(run, name, models, ladder)
-    confirmed = [name for name in order if ladder[name].confirmed]
-    best = order[0]
-    for name in confirmed:
-        best = name if ladder[name].improves_on(ladder[best]) else best
-    parameters: dict[str, dict[str, Value]] = {}
-    for name in order:
+        if ladder[name].confirmed and ladder[name].improves_on(ladder[best]):
+            best = name
         for key, found in run.read(IdentifyResult, name).parameters.items():
             parameters.setdefault(key, {})[name] = Value.of(found)
+    confirmed = [name for name in order if ladder[name].confirmed]
     moved = _moved(parameters, models, confirmed, config.sigmas)
     return CompareResult(
         best=best, ladder=tuple(ladder.values()), parameters=parameters, moved=tuple(moved)

@@ -109,14 +109,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             where=str(run.root),
             remedy="judge it by validate and compare, and diagnose the model that it came from",
         ) from error
-    given = selection.initial.evidence
-    samples = _map_variables(given)
+    samples = _map_variables(selection.initial.evidence)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
     progress(0.95, "looking for a trial that would decide")
     result = _result(session, selection, recipe, config)
-    result = result.model_copy(
-        update={"suggested_trial": suggest_trial(session, selection.final, result)}
-    )
+    trial = suggest_trial(session, selection.final, result)
+    result = result.model_copy(update={"suggested_trial": trial})
     headline = "; ".join(f"{axis}: {phrases.verdict(result, axis)}" for axis in result.axes)
     return {"headline": headline, **_summary(result.write(out), phrases.limits(result))}
 
@@ -149,9 +147,7 @@ def _require_sound_setup(run: RunFolder) -> None:
 
 def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:
     """Return the summary for a person: verdicts, the head of the ranking, the next step."""
-    notes = [limits] if limits else []
-    if result["suggested_trial"]:
-        notes.append(result["suggested_trial"]["sentence"])
+    trial = result["suggested_trial"] or {"sentence": ""}
     shown = ("verdict", "rmse_before", "rmse_after", "unit", "sentence")
     return {
         "axes": {
@@ -164,7 +160,7 @@ def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:
         ],
         "selected": result["selected"],
         "suggested_trial": result["suggested_trial"],
-        "notes": notes,
+        "notes": [*filter(None, (limits, trial["sentence"]))],
     }
 
 
@@ -178,9 +174,7 @@ def _result(
     known = sorted({entry.effect.partition(":")[0] for entry in ranking[:_DESCRIBED]})
     maps = {}
     for i, axis in enumerate(names):
-        drawn = [
-            residual_map(given, i, variable) for variable in variables(given.fitted, given.band, i)
-        ]
+        drawn = (residual_map(given, i, one) for one in variables(given.fitted, given.band, i))
         maps[axis] = {m.variable: ResidualMap.of(m, variance_share=m.share) for m in drawn}
     result = DiagnoseResult(
         model=config.model,
@@ -203,13 +197,11 @@ def _result(
         next="",
     )
     result = result.model_copy(update={"next": _next(result, bool(recipe.effects))})
-    shapes = {
-        axis: describe(
-            (selection.final if result.axes[axis].effects else selection.initial).evidence, i
-        )
-        for i, axis in enumerate(names)
-        if result.axes[axis].remains
-    }
+    shapes = {}
+    for i, (axis, entry) in enumerate(result.axes.items()):
+        if entry.remains:
+            fit = selection.final if entry.effects else selection.initial
+            shapes[axis] = describe(fit.evidence, i)
     said = phrases.describe_axes(result, shapes)
     axes = {
         axis: entry.model_copy(update={"sentence": said[axis]})

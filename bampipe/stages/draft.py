@@ -41,6 +41,9 @@ OUTPUTS = ("models/{model}/draft.json", "models/{model}/drafts/*.toml")
 
 _NEAREST = 3
 """Effects of the library that are compared with a draft."""
+_MORE_TRIALS = (
+    "record more trials like these: the residual follows none of the quantities that formulas use"
+)
 _MORE_FORMULAS = (
     f" Formulas in several quantities were not searched: pip install 'bampipe[{symbolic.EXTRA}]'"
     " brings pyoperon."
@@ -89,13 +92,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     on = f", recorded on {ingested.recorded_at[:10]}" if ingested.recorded_at else ""
     source = f"drafted by bampipe from {ingested.session_id}{on}"
     axes = [system.coordinates.index(axis) for axis in diagnosis.unnamed_axes]
-    found = draft_formulas(
-        session, read_recipe(run, config.model, model), read_estimate(run, config.model, system),
-        axes, source, config.curve, progress,
-    )  # fmt: skip
+    recipe, start = read_recipe(run, config.model, model), read_estimate(run, config.model, system)
     effects: dict[str, DraftedEffect] = {}
     entries: dict[str, AxisDraft] = {}
-    for one in found:
+    for one in draft_formulas(session, recipe, start, axes, source, config.curve, progress):
         axis = system.coordinates[one.axis]
         drafted: dict[str, DraftedEffect] = {}
         named = diagnosis.axes[axis]
@@ -108,16 +108,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         entries[axis] = _axis(axis, one, drafted, named, rows)
         effects |= drafted
     selected = tuple(effects)
-    advice = (
-        "record more trials like these: the residual follows none of the quantities that formulas"
-        " use"
-    )
-    if added := selected or diagnosis.selected:
-        advice = f"bampipe extend RUN {' '.join(added)} --model {diagnosis.model}"
+    added = selected or diagnosis.selected
+    advice = f"bampipe extend RUN {' '.join(added)} --model {diagnosis.model}"
     DraftResult(
         model=diagnosis.model,
         sentence=" ".join(entry.sentence for entry in entries.values()),
-        next=advice,
+        next=advice if added else _MORE_TRIALS,
         axes=entries,
         effects=effects,
         selected=selected,
@@ -134,18 +130,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 
 def _effect(term: Term, file: str) -> DraftedEffect:
     form, unit = term.form, term.form.unit
-    units = {name: unit for name in form.shape.strengths}
+    units = dict.fromkeys(form.shape.strengths, unit)
     units |= {name: of for name, (_, _, of) in form.limits().items()}
     at, mean, sd = term.curve()
-    constants = {
-        name: FittedConstant(
-            value=value,
-            low=value - NORMAL_95 * term.sd[name],
-            high=value + NORMAL_95 * term.sd[name],
-            unit=units[name],
-        )
-        for name, value in term.values.items()
-    }
+    constants = {}
+    for name, value in term.values.items():
+        half = NORMAL_95 * term.sd[name]
+        ends = {"low": value - half, "high": value + half}
+        constants[name] = FittedConstant(value=value, unit=units[name], **ends)
     numbers = ", ".join(
         f"{name} {round_with_sd(c.value, 0.5 * (c.high - c.low))} {c.unit}".rstrip()
         for name, c in constants.items()

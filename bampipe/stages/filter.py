@@ -18,7 +18,7 @@ from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother
-from bampipe.estimate.differentiation import UniformGrid, uniform_grid
+from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.white_noise import white_noise_sd
 from bampipe.lists import count_noun
@@ -98,19 +98,6 @@ class Config:
     force_cutoff_hz: NotNegative = 0.0
     band_hz: NotNegative = 0.0
     tuning_samples: Annotated[int, Field(ge=1000)] = 120_000
-
-
-@dataclass(frozen=True)
-class _Trial:
-    """One trial on its uniform grid."""
-
-    trial_id: str
-    grid: UniformGrid
-    frame: pd.DataFrame
-
-    @property
-    def observed(self) -> Flags:
-        return np.logical_not(self.grid.bridged)
 
 
 @dataclass(frozen=True)
@@ -274,13 +261,12 @@ def _write_motions(
     with ParquetAppender(path) as file:
         for number, trial_id in enumerate(ids):
             progress(0.2 + 0.7 * number / len(ids), trial_id)
-            trial = _load(samples, trial_id, kinematics.rate_hz)
-            if isinstance(trial, str):
-                written.skipped[trial_id] = trial
+            frame = read_parquet(samples, trial=trial_id).dropna()
+            if short := _tell_shortness(frame):
+                written.skipped[trial_id] = short
                 continue
             for axis, one in kinematics.axes.items():
-                position = trial.frame[f"q_{axis}"].to_numpy(dtype=np.float64)
-                if _outruns(position, one.noise_sd):
+                if _outruns(frame[f"q_{axis}"].to_numpy(dtype=np.float64), one.noise_sd):
                     written.skipped[trial_id] = (
                         f"{axis} moves too fast for {kinematics.rate_hz:g} samples a second: log"
                         " it at a higher rate"
@@ -288,10 +274,10 @@ def _write_motions(
             if trial_id in written.skipped:
                 continue
             for name, offset in offsets.get(trial_id, {}).items():
-                trial.frame[name] -= offset
-            frame, errors = _differentiate(trial, kinematics)
-            file.append(frame)
-            written.interpolated[trial_id] = float(np.mean(trial.grid.bridged))
+                frame[name] -= offset
+            rows, errors = _differentiate(trial_id, frame, kinematics)
+            file.append(rows)
+            written.interpolated[trial_id] = float(np.mean(rows["bridged"]))
             for axis, levels in written.levels.items():
                 levels.append(errors[axis])
     return written
@@ -348,12 +334,10 @@ def _inspect(
     return inspect_setup(system, session, motions, band, folds, ids)
 
 
-def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:
-    """Return the trial on its grid, or why it cannot be differentiated."""
-    frame = read_parquet(samples, trial=trial_id).dropna()
-    if len(frame) < _SHORTEST:
-        return f"{len(frame)} sound samples, of which {_SHORTEST} are needed"
-    return _Trial(trial_id, uniform_grid(frame["t"].to_numpy(dtype=np.float64), rate), frame)
+def _tell_shortness(frame: pd.DataFrame) -> str:
+    """Return why a trial with these samples is too short to be differentiated, else ""."""
+    is_short = len(frame) < _SHORTEST
+    return f"{len(frame)} sound samples, of which {_SHORTEST} are needed" if is_short else ""
 
 
 def _tuning_records(
@@ -372,14 +356,15 @@ def _tuning_records(
     for number, place in enumerate((*spread, *rest)):
         if number >= len(spread) and any(records.values()):
             break
-        trial = _load(samples, ids[place], rate)
-        if isinstance(trial, str):
-            refused[ids[place]] = trial
+        frame = read_parquet(samples, trial=ids[place]).dropna()
+        if short := _tell_shortness(frame):
+            refused[ids[place]] = short
             continue
+        grid = uniform_grid(frame["t"].to_numpy(dtype=np.float64), rate)
         for axis in axes:
-            position = trial.grid.resample(trial.frame[f"q_{axis}"].to_numpy(dtype=np.float64))
+            position = grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64))
             # Copies: a view would keep the whole trial.
-            records[axis].append((position[:share].copy(), trial.observed[:share].copy()))
+            records[axis].append((position[:share].copy(), ~grid.bridged[:share]))
     return records, refused
 
 
@@ -434,13 +419,12 @@ def _choose(
     report: dict[str, Any] = {
         "bandwidth_hz": cutoff,
         "bandwidth_reason": why,
+        "order": order if kalman else None,
         "measurement_noise_sd": noise_sd,
         "quantisation_sd": resolution / float(np.sqrt(12.0)),
         "resolution": resolution,
         "log_likelihood": {str(k): f.log_likelihood for k, f in fits.items()},
     }
-    if kalman:
-        report["order"] = order
     return AxisFilter(cutoff, noise_sd, order if kalman else 0), report
 
 
@@ -455,15 +439,15 @@ def _outruns(position: Array, noise_sd: float) -> bool:
 
 
 def _differentiate(
-    trial: _Trial, kinematics: Kinematics
+    trial_id: str, frame: pd.DataFrame, kinematics: Kinematics
 ) -> tuple[pd.DataFrame, dict[str, tuple[float, float, float]]]:
     """Return the rows of one trial and, per axis, the median error bands (position, ...)."""
-    grid, frame = trial.grid, trial.frame
-    columns: dict[str, object] = {"trial_id": trial.trial_id, "t": grid.t}
+    grid = uniform_grid(frame["t"].to_numpy(dtype=np.float64), kinematics.rate_hz)
+    columns: dict[str, object] = {"trial_id": trial_id, "t": grid.t}
     columns["stamp_offset"] = grid.stamp_offset
     motions = {
         axis: kinematics.differentiate(
-            axis, grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64)), trial.observed
+            axis, grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64)), ~grid.bridged
         )
         for axis in kinematics.axes
     }

@@ -221,11 +221,11 @@ def _fit(task: _Task, start: Array) -> tuple[SquaresFit, InputTiming | None]:
             remedy="record faster motion at a higher rate, or more of it",
         ) from error
     require_enough(squares, str(task.run.root))
-    robot = system.model.device.robot is not None
-    if not (task.config.input_timing and system.has_free_delay and robot):
-        return squares, None
-    late_s, sd = find_robot_timing(system, trials.motions, trials.band, squares.p[:-1])
-    if abs(late_s) < NORMAL_95 * sd:
+    is_late, sd, late_s = False, 0.0, 0.0
+    if config.input_timing and system.has_free_delay and system.model.device.robot is not None:
+        late_s, sd = find_robot_timing(system, trials.motions, trials.band, squares.p[:-1])
+        is_late = abs(late_s) >= NORMAL_95 * sd
+    if not is_late:
         return squares, None
     late_s = float(np.clip(late_s, -trials.limit_s, trials.limit_s))
     moved = trials.with_input_timing(late_s)
@@ -242,13 +242,13 @@ def _filter(
     progress: Progress,
 ) -> tuple[Estimate | None, str]:
     """Return the filter's estimate if requested; otherwise the reason, "" if none is due."""
-    config = task.config
+    config, why_not = task.config, None
     if config.method == "least-squares":
-        return None, ""
-    if config.method == "auto":
+        why_not = ""
+    elif config.method == "auto":
         why_not = why_not_filtered(task.system, squares, config.longest_step_s)
-        if why_not is not None:
-            return None, why_not
+    if why_not is not None:
+        return None, why_not
     try:
         filtering = Filtering(
             task.run, task.system, task.recipe, config.model, start, squares, by_squares.sd, noise,
@@ -291,18 +291,17 @@ def _find_timing(task: _Task, squares: SquaresFit, held: InputTiming | None) -> 
 
 def _describe_squares(task: _Task, squares: SquaresFit) -> list[str]:
     """Return notes on least squares: no replicates, or an axis that nothing drives."""
-    notes, system = [], task.system
-    if task.config.remove_bias and not squares.has_replicates:
-        notes.append(
-            "The model cannot be simulated on these trials, so all samples have equal weight and"
-            " the bias of filters was not removed."
-        )
-    if system.undriven:
-        notes.append(
-            f"No force acts on {', '.join(system.undriven)}: least squares underestimates the"
-            " terms of that equation, the more so the more the model lacks."
-        )
-    return notes
+    simulated = squares.has_replicates or not task.config.remove_bias
+    equal = (
+        "The model cannot be simulated on these trials, so all samples have equal weight and the"
+        " bias of filters was not removed."
+    )
+    undriven = task.system.undriven
+    small = (
+        f"No force acts on {', '.join(undriven)}: least squares underestimates the terms of that"
+        " equation, the more so the more the model lacks."
+    )
+    return [equal] * (not simulated) + [small] * bool(undriven)
 
 
 def _start(task: _Task) -> Array:
@@ -337,14 +336,11 @@ def _choose_width(run: RunFolder, system: System, config: Config) -> SignWidth |
 
 def _describe_width(system: System, width: SignWidth) -> list[str]:
     """Return the chosen narrower width, and the reason, for each axis of a narrowed model."""
-    said = []
-    for i, axis in enumerate(system.model.device.coordinates):
-        before, after = width.declared[i], width.chosen[i]
-        said.append(
-            f"{axis.name}: the sign of the velocity is smoothed over"
-            f" {significant(axis.sign_width)} {axis.unit}/s, {significant(width.factor)} of the"
-            " device's `sign_width`, because the held-out error then falls from"
-            f" {significant(before)} to {significant(after)} {system.torque_units[i]}. Put"
-            f" `sign_width = {axis.sign_width:.2g}` into the device file to start from it."
-        )
-    return said
+    return [
+        f"{axis.name}: the sign of the velocity is smoothed over {significant(axis.sign_width)}"
+        f" {axis.unit}/s, {significant(width.factor)} of the device's `sign_width`, because the"
+        f" held-out error then falls from {significant(width.declared[i])} to"
+        f" {significant(width.chosen[i])} {system.torque_units[i]}. Put"
+        f" `sign_width = {axis.sign_width:.2g}` into the device file to start from it."
+        for i, axis in enumerate(system.model.device.coordinates)
+    ]

@@ -85,19 +85,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if session.device_file is not None:
         _write_device(session.device_file, device, out / "ingest")
     spans = {row["trial_id"]: row["spans"] for row in rows if row["spans"]}
+    replaced = "physically impossible body replaced by the nearest possible one"
     notes = [
         *describe_spans(spans),
         *description.sensor_warnings,
         *map(phrases.describe_hum, description.mains_hum),
-    ]
-    if device.robot is not None:
-        notes += [
-            f"physically impossible body replaced by the nearest possible one: {line}"
-            for line in device.robot.impossible
-        ]
-    notes += [
-        (f"{place}: still a placeholder, with `fill in` as its source")
-        for place in description.placeholders
+        *(f"{replaced}: {one}" for one in (device.robot.impossible if device.robot else ())),
+        *map(phrases.describe_placeholder, description.placeholders),
     ]
     if every > 1:
         notes.append(

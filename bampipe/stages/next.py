@@ -256,18 +256,12 @@ def _rank(
     def report(first: float, fraction: float, message: str) -> None:
         progress(first + 0.3 * fraction, message)
 
-    comparison, detectability = forecast.comparison, forecast.detectability
+    early, comparison = partial(report, 0.2), forecast.comparison
     if comparison is not None:
-        return rank_designs(
-            space, lambda motion: -comparison.confusion_with(motion), partial(report, 0.2)
-        )
-    if detectability is not None:
-        watched = detectability.keep_hidden(_WATCHED)
-        ranked = (
-            rank_designs(space, watched.gain, partial(report, 0.2), _LITTLE)
-            if watched.limits
-            else []
-        )
+        return rank_designs(space, lambda motion: -comparison.confusion_with(motion), early)
+    if forecast.detectability is not None:
+        watched = forecast.detectability.keep_hidden(_WATCHED)
+        ranked = rank_designs(space, watched.gain, early, _LITTLE) if watched.limits else []
         if ranked and ranked[0].utility >= _LITTLE:
             return ranked
         # No motion would show more: propose for the parameters.
@@ -310,7 +304,10 @@ def _record(
     )
     unlimited = [axis for axis in case.system.coordinates if axis not in limits]
     missing = case.diagnosed.selected if case.diagnosed is not None else None
-    why, expected = explain_proposal(result, unlimited, _find_lacking(case), missing, unbraked)
+    judged = case.diagnosed or case.run.find(ValidateResult, case.config.model)
+    axes = judged.axes.items() if judged is not None else ()
+    lacking = [axis for axis, entry in axes if entry.standing == "above_floor"]
+    why, expected = explain_proposal(result, unlimited, lacking, missing, unbraked)
     return result.model_copy(update={"why": why, "expected": expected})
 
 
@@ -403,13 +400,6 @@ def _find_detectability(case: _Case) -> Detectability:
         ) from error
     chance = case.diagnosed.chance if case.diagnosed is not None else None
     return find_detectability(case.session, fit, chance.largest if chance is not None else ())
-
-
-def _find_lacking(case: _Case) -> list[str]:
-    """Axes whose held-out error is above the noise floor."""
-    found = case.diagnosed or case.run.find(ValidateResult, case.config.model)
-    axes = found.axes.items() if found is not None else ()
-    return [axis for axis, entry in axes if entry.standing == "above_floor"]
 
 
 def _summary(result: NextResult) -> dict[str, object]:

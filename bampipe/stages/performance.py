@@ -57,14 +57,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         [np.nanmin(q.to_numpy(dtype=float), 0), np.nanmax(q.to_numpy(dtype=float), 0)], 1
     )
     # Its largest quantile leaves out the noise of the force sensor.
-    forces = read_parquet(
-        run.require("ingest/samples.parquet", "ingest"), columns=[*device.forces]
-    ).to_numpy(dtype=float)
-    sizes = np.linalg.norm(forces, axis=1)
-    sizes = sizes[np.isfinite(sizes)]
-    largest = (
-        Quantity(value=np.quantile(sizes, 0.999), unit=device.force_unit) if sizes.size else None
-    )
+    samples = run.require("ingest/samples.parquet", "ingest")
+    sizes = np.linalg.norm(read_parquet(samples, columns=[*device.forces]).dropna(), axis=1)
+    largest = None
+    if sizes.size:
+        largest = Quantity(value=np.quantile(sizes, 0.999), unit=device.force_unit)
     # Only a handle that can be pushed in as many directions as there are axes has a stiffness of
     # its own; a device driven by a motor has no handle.
     ways = len(device.forces) == len(system.coordinates)
@@ -75,10 +72,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         headline=_headline(handle, device.prescribed) if handle else "No handle on this device.",
         constants={name: DeviceConstant.of(item) for name, item in device.constants.items()},
         range={
-            axis: Range(lower=low, upper=high, unit=unit)
-            for axis, unit, (low, high) in zip(
-                system.coordinates, system.coordinate_units, reach, strict=True
-            )
+            axis: Range(lower=reach[i, 0], upper=reach[i, 1], unit=system.coordinate_units[i])
+            for i, axis in enumerate(system.coordinates)
         },
         resolution={
             axis: Resolution(value=entry.resolution, unit=entry.unit)
@@ -111,7 +106,7 @@ def _handle(run: RunFolder, system: System, p: Array, reach: Array, points: int)
     back = np.linalg.inv(gain[regular])
     swept = "m" if len(axes) == 1 else f"m{len(axes)}"
     within = None
-    if all(limit is not None for limit in limits):
+    if None not in limits:
         volume = _volume(system, np.array(limits, dtype=float), p, points)
         within = Quantity(value=volume, unit=swept)
     known = {item.name: value for item, value in zip(system.parameters, p, strict=True)}

@@ -118,7 +118,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             for trial in found:
                 file.append(_loop_rows(axis, trial))
         if not loops:
-            file.append(pd.DataFrame({n: pd.Series(dtype=kind) for n, kind in _COLUMNS.items()}))
+            file.append(pd.DataFrame(columns=[*_COLUMNS]).astype(_COLUMNS))
     said = [
         f"{axis} {round_with_sd(entry.stiffness, entry.sd)} {entry.unit} "
         f"({entry.bandwidth_rad_s:.3g} rad/s, {entry.bandwidth_hz:.3g} Hz)"
@@ -177,14 +177,15 @@ def _gear(
 ) -> GearStiffness:
     number = system.coordinates.index(axis)
     unit = system.coordinate_units[number]
-    size = abs(windup.compliance)
-    sure = size > _SURE * windup.compliance_sd
-    if not sure:
+    size, stiffness, sd = abs(windup.compliance), None, None
+    if size > _SURE * windup.compliance_sd:
+        stiffness, sd = 1.0 / size, windup.compliance_sd / size**2
+    else:
         notes.append(f"{axis}: its two encoders do not move apart with the load.")
     return GearStiffness.of(
         windup,
-        stiffness=1.0 / size if sure else None,
-        sd=windup.compliance_sd / size**2 if sure else None,
+        stiffness=stiffness,
+        sd=sd,
         unit=f"{system.torque_units[number]}/{unit}",
         play=None if windup.play is None else windup.play * np.sign(windup.compliance),
         play_unit=unit,
@@ -281,6 +282,7 @@ def _axis(
         for name, share in trial.calibration.items():
             shares[name] += weight * share
     calibration = stiffness * float(np.linalg.norm(list(shares.values())))
+    drifts = {trial.trial_id: _drift(trial) for trial in trials}
     for trial in trials:
         if not trial.found.yielded:
             notes.append(
@@ -288,8 +290,7 @@ def _axis(
                 f" {100.0 * trial.found.slope_change:.1f} % over their straight part, so the"
                 " stiffness is too high: load the axis further."
             )
-        drift = _drift(trial)
-        if abs(drift) > config.largest_drift:
+        if abs(drift := drifts[trial.trial_id]) > config.largest_drift:
             notes.append(
                 f"{trial.trial_id}: the loops drift by {100.0 * drift:.1f} % of their range, so"
                 " the brake slips."
@@ -333,9 +334,7 @@ def _axis(
             )
             for trial, cycle in cycles
         ),
-        trials={
-            trial.trial_id: LockedTrial.of(trial.found, drift=_drift(trial)) for trial in trials
-        },
+        trials={t.trial_id: LockedTrial.of(t.found, drift=drifts[t.trial_id]) for t in trials},
     )
 
 

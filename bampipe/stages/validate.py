@@ -17,6 +17,7 @@ from bampipe.diagnosis.session import Session
 from bampipe.errors import InputError
 from bampipe.identification.free_run import find_drift, free_runs
 from bampipe.identification.terms import describe_terms
+from bampipe.lists import count_noun
 from bampipe.phrases.results import find_failed_checks
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
@@ -82,12 +83,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     compared = KeptItems(
         compare_trial(system, trials, k, published, p) for k, p in enumerate(unseen)
     )
-    notes = []
-    if trials.blocks == len(trials.motions):
-        notes.append(
-            f"There is one trial: it is predicted in {trials.blocks} blocks, each with the"
-            " estimate from the others."
-        )
+    alone = (
+        f"There is one trial: it is predicted in {trials.blocks} blocks, each with the estimate"
+        " from the others."
+    )
+    notes = [alone] * (trials.blocks == len(trials.motions))
     if trials.folds.nothing_held_out:
         notes.append("With one trial or group, nothing is held out: the error is that of the fit.")
     floor: NoiseFloor | None = None
@@ -185,12 +185,9 @@ def _silent_joints(
         if entry.fit_percent is None or entry.fit_percent >= SILENT_PERCENT:
             continue
         size = rms((c.measured for c in compared), (c.used for c in compared))[i]
-        buried = floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]
-        why = (
-            "noise and friction mask it"
-            if buried
-            else ("the model lacks the effect that dominates it")
-        )
+        why = "the model lacks the effect that dominates it"
+        if floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]:
+            why = "noise and friction mask it"
         share = max(entry.fit_percent, 0.0)
         found.append(
             f"{axis}: the model explains {share:.0f} % of its torque of {size:.2g} {entry.unit}"
@@ -224,14 +221,11 @@ def _result(
         error_of = np.concatenate([c.force_residual[c.used.all(axis=1), column] for c in compared])
         rmse = np.sqrt(np.mean(error_of**2)) if error_of.size else 0.0
         forces[name] = ForceError(rmse=rmse, unit=system.model.device.force_unit)
-    best = ", ".join(
-        f"{axis} {entry.fit_percent:.1f} %"
-        for axis, entry in axes.items()
-        if entry.fit_percent is not None
-    )
+    fits = {axis: e.fit_percent for axis, e in axes.items() if e.fit_percent is not None}
+    best = ", ".join(f"{axis} {fit:.1f} %" for axis, fit in fits.items())
     on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"
     failed = tuple(find_failed_checks(run.read(IngestResult), identified, axes))
-    checks = f"; {len(failed)} check{'s' if len(failed) > 1 else ''} failed" if failed else ""
+    checks = f"; {count_noun(len(failed), 'check')} failed" if failed else ""
     return ValidateResult(
         model=identified.model,
         axes=axes,

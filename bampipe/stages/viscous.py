@@ -74,8 +74,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = trials[trials["trial_id"].astype(str).isin(moving)]
     target = f"models/{config.model}/viscous"
     if trials.empty:
-        kinds = {"t_total": "float64", "trial_id": "str"}
-        rows = pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in kinds.items()})
+        rows = pd.DataFrame(columns=["t_total", "trial_id"])
+        rows = rows.astype({"t_total": "float64", "trial_id": "str"})
         write_parquet(out / f"{target}.parquet", rows)
         headline = "No trials in a viscous field in this session."
         empty = ViscousResult(model=config.model, directions={}, trials=(), headline=headline)
@@ -110,11 +110,9 @@ def _estimated(
     progress: Progress,
 ) -> tuple[ViscousResult, pd.DataFrame]:
     """Return the content of viscous.json, and the convergence of the estimates."""
-    known = identified.parameters
-    start = system.prior
+    known, start = identified.parameters, system.prior
     for i, item in enumerate(system.parameters):
-        if item.name in known:
-            start[i] = known[item.name].estimate
+        start[i] = known[item.name].estimate if item.name in known else start[i]
     noise = sensor_noise(read_sensors(run, system), system, motions, start, config)
     settings = untuned_settings(system, noise, config)
     if identified.noise is not None and config.force_noise == 0.0:
@@ -131,9 +129,8 @@ def _estimated(
     late_s = identified.input_timing.estimate
     model = build_filter_model(system, readings, start, False, late_s)
     command = float(np.nanmean(commanded)) if np.isfinite(commanded).any() else None
-    value = np.array(
-        [known[item.name].estimate if item.name in known else (command or 0.0) for item in free]
-    )
+    estimates = {name: one.estimate for name, one in known.items()}
+    value = np.array([estimates.get(item.name, command or 0.0) for item in free])
     sd = np.array([known[item.name].sd if item.name in known else item.sd for item in free])
     sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
 
@@ -203,14 +200,13 @@ def _device_damping(system: System, motions: Sequence[Motion], p: Array) -> Arra
     """
     parameters = {item.name: value for item, value in zip(system.parameters, p, strict=True)}
     joint = np.diag([parameters.get(f"viscous.{axis}", 0.0) for axis in system.coordinates])
-    total, count = 0.0, 0
+    felt = []
     for motion in motions:
         rows = slice(None, None, max(1, len(motion.t) // 500))
         u = motion.inputs(system.inputs)[rows]
         back = np.linalg.pinv(system.input_map(motion.q[rows], u, p))
-        felt = np.einsum("tfi,ij,tfj->tf", back, joint, back)
-        total, count = total + felt.sum(axis=0), count + len(felt)
-    return np.asarray(total / count)
+        felt.append(np.einsum("tfi,ij,tfj->tf", back, joint, back))
+    return np.asarray(np.concatenate(felt).mean(axis=0))
 
 
 def _direction(
@@ -225,16 +221,13 @@ def _direction(
         return found()
     ratios = [abs(value - command) / sd if sd > 0.0 else np.inf for value in (estimate, felt)]
     p, felt_p = (float(2.0 * stats.t.sf(ratio, max(blocks - 1, 1))) for ratio in ratios)
-    what = (
-        f"differs from the commanded {command:.4g}"
-        if p < _SIGNIFICANT
-        else f"no significant difference from the commanded {command:.4g}"
-    )
+    differs = p < _SIGNIFICANT
+    what = "differs" if differs else "no significant difference"
     return found(
         commanded=command,
         p_value=p,
-        differs=p < _SIGNIFICANT,
+        differs=differs,
         felt_p_value=felt_p,
         felt_differs=felt_p < _SIGNIFICANT,
-        verdict=f"{what}, p = {p:.2g}",
+        verdict=f"{what} from the commanded {command:.4g}, p = {p:.2g}",
     )

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from bampipe.data.store import write_parquet
 from bampipe.errors import InputError
 from bampipe.files import read_json, toml_text, write_json, write_text
-from bampipe.report.explorer.packing import PackedColumn, Packer
+from bampipe.report.explorer.packing import Packer
 from bampipe.report.explorer.page import explorer_page
 from bampipe.report.run_results import Results
 from bampipe.stages.report import write_page_of_two
@@ -40,12 +40,12 @@ def unfold(packer: Packer, block: int, width: int) -> np.ndarray:
     return np.where(folded % 2, -(folded + 1) // 2, folded // 2)
 
 
-def unpack(packer: Packer, column: PackedColumn) -> np.ndarray:
-    codes = unfold(packer, column.block, 2)
-    for _ in range(column.order):
+def unpack(packer: Packer, column: dict[str, float]) -> np.ndarray:
+    codes = unfold(packer, column["block"], 2)
+    for _ in range(column["order"]):
         codes = np.cumsum(codes)
     codes %= 2**16
-    return np.where(codes == 65535, np.nan, column.low + column.step * codes)
+    return np.where(codes == 65535, np.nan, column["low"] + column["step"] * codes)
 
 
 @given(st.lists(st.floats(-1e9, 1e9, width=32) | st.just(np.nan), max_size=200), st.integers(0, 3))
@@ -71,7 +71,7 @@ def test_times_keep_microseconds_over_gaps_and_hours() -> None:
 def test_equal_columns_are_packed_once() -> None:
     packer = Packer()
     first, second = packer.pack(np.arange(9.0)), packer.pack(5.0 + 2.0 * np.arange(9.0))
-    assert first.block == second.block and first.low != second.low
+    assert first["block"] == second["block"] and first["low"] != second["low"]
     assert len(packer.blocks) == 1
 
 

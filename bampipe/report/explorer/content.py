@@ -1,7 +1,7 @@
 """Content of the page for exploring a run: stored records as plain tables, columns packed."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,17 +25,6 @@ _BREAK_S = 0.5
 
 Cell = str | float | int | None
 Content = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class _Span:
-    """Place of a trial on the common axis of time: ``t`` of the trial plus ``offset``."""
-
-    id: str
-    kind: str
-    start: float
-    stop: float
-    offset: float
 
 
 @dataclass(frozen=True)
@@ -105,7 +94,7 @@ def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
         "models": [_describe_model(version) for version in versions],
         "shown": results.models.index(results.model) if results.models else 0,
         "axes": axes,
-        "trials": [asdict(span) for span in spans],
+        "trials": spans,
         "grids": grids.described,
         "channels": grids.channels,
         "maps": _list_maps(versions),
@@ -119,9 +108,13 @@ def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
     }
 
 
-def _place_trials(sessions: Sequence[_Session]) -> list[_Span]:
-    """Return the trials that were read, in order."""
-    found, start = [], 0.0
+def _place_trials(sessions: Sequence[_Session]) -> list[Content]:
+    """Return the trials that were read, in order, each placed on the common axis of time.
+
+    Time on that axis is ``t`` of the trial plus its ``offset``.
+    """
+    found: list[Content] = []
+    start = 0.0
     for session in sessions:
         for row in session.results.trials.to_dict("records"):
             name = str(row["trial_id"])
@@ -129,9 +122,9 @@ def _place_trials(sessions: Sequence[_Session]) -> list[_Span]:
             if times is None:
                 continue
             first, last = float(times["t"].iloc[0]), float(times["t"].iloc[-1])
+            about = {"id": session.prefix + name, "kind": str(row["kind"]), "start": start}
             stop = start + last - first
-            kind = str(row["kind"])
-            found.append(_Span(session.prefix + name, kind, start, stop, start - first))
+            found.append({**about, "stop": stop, "offset": start - first})
             start = stop + _BREAK_S
     return found
 
@@ -145,20 +138,20 @@ def _join(frames: Iterable[pd.DataFrame | None]) -> pd.DataFrame | None:
 class _Grids:
     """Channels grouped by their common grid of times, each packed when it is added."""
 
-    def __init__(self, spans: Sequence[_Span], packer: Packer) -> None:
+    def __init__(self, spans: Sequence[Content], packer: Packer) -> None:
         self.channels: list[Content] = []
         self.described: Content = {}
-        self._spans = {span.id: span for span in spans}
+        self._offsets = {span["id"]: span["offset"] for span in spans}
         self._packer = packer
         self._rows: dict[str, pd.MultiIndex] = {}
 
     def start(self, name: str, frame: pd.DataFrame) -> pd.DataFrame:
         """Make a grid of the times in ``frame``; return its rows in the order of the trials."""
-        order = {trial: number for number, trial in enumerate(self._spans)}
+        order = {trial: number for number, trial in enumerate(self._offsets)}
         known = frame[frame["trial_id"].isin(order)]
         known = known.sort_values("trial_id", key=lambda ids: ids.map(order), kind="stable")
-        offsets = known["trial_id"].map({k: span.offset for k, span in self._spans.items()})
-        times = known["t"].to_numpy() + offsets.to_numpy(dtype=float)
+        offsets = known["trial_id"].map(self._offsets).to_numpy(dtype=float)
+        times = known["t"].to_numpy() + offsets
         ids = known["trial_id"].to_numpy()
         bounds = [*(np.flatnonzero(ids[1:] != ids[:-1]) + 1).tolist(), len(ids)]
         block = self._packer.pack_times(times)
@@ -176,7 +169,7 @@ class _Grids:
     def add(self, grid: str, values: object, **meaning: Cell) -> None:
         """Add one channel of ``grid``."""
         packed = self._packer.pack(np.asarray(values, dtype=np.float64))
-        self.channels.append({"grid": grid, **asdict(packed), **meaning})
+        self.channels.append({"grid": grid, **packed, **meaning})
 
 
 def _add_residuals(results: Results, versions: Sequence[_Version], grids: _Grids) -> None:
@@ -188,9 +181,9 @@ def _add_residuals(results: Results, versions: Sequence[_Version], grids: _Grids
         return
     rows = grids.start("residuals", measured)
     axes = [axis for axis in results.axes if f"torque_measured_{axis}" in rows]
+    about = {axis: {"axis": axis, "unit": format_unit(results.force_unit(axis))} for axis in axes}
     for axis in axes:
-        about: Content = {"axis": axis, "unit": format_unit(results.force_unit(axis))}
-        grids.add("residuals", rows[f"torque_measured_{axis}"], role="measured", **about)
+        grids.add("residuals", rows[f"torque_measured_{axis}"], role="measured", **about[axis])
         if f"moving_{axis}" in rows:
             grids.add("residuals", rows[f"moving_{axis}"], role="moving", axis=axis, unit="")
     for number, frame in enumerate(frames):
@@ -198,10 +191,9 @@ def _add_residuals(results: Results, versions: Sequence[_Version], grids: _Grids
         if own is None:
             continue
         for axis in axes:
-            unit = format_unit(results.force_unit(axis))
-            about = {"axis": axis, "unit": unit, "model": number}
             for role, column in (("predicted", "torque_predicted"), ("residual", "residual")):
-                grids.add("residuals", own[f"{column}_{axis}"], role=role, **about)
+                values = own[f"{column}_{axis}"]
+                grids.add("residuals", values, role=role, **about[axis], model=number)
 
 
 def _add_map_variables(results: Results, versions: Sequence[_Version], grids: _Grids) -> None:
@@ -242,8 +234,8 @@ def _add_recorded(sessions: Sequence[_Session], grids: _Grids) -> None:
             about = {"label": labels[name], "unit": format_unit(units[name])}
             about |= {"position": positions[name]} if name in positions else {}
             grids.add("recorded", rows[name], role="recorded", **about)
-    path = "filter/kinematics.parquet"
-    rates = [axis for axis in results.axes if f"qd_{axis}" in results.columns(path)]
+    path, known = "filter/kinematics.parquet", results.columns("filter/kinematics.parquet")
+    rates = [axis for axis in results.axes if f"qd_{axis}" in known]
     wanted = ["trial_id", "t", *(f"qd_{axis}" for axis in rates)]
     motion = _join(one.table(path, wanted) for one in sessions) if rates else None
     if motion is not None:
@@ -316,20 +308,19 @@ def _list_verdicts(versions: Sequence[_Version]) -> list[Content]:
 
 
 def _describe_effect(diagnosis: DiagnoseResult, axis: str, name: str, share: float) -> Content:
-    ranked = [
+    ranked = (
         {**one.model_dump(mode="json"), "unit": format_unit(one.unit)}
         for one in diagnosis.ranking
         if (one.effect, one.axis) == (name, axis)
-    ]
+    )
     said = diagnosis.descriptions.get(name.partition(":")[0])
     sets = [
         {"effects": phrases.name_set(one), "probability": one.probability}
         for one in diagnosis.sets
         if name in one.effects
     ]
-    entry = next(iter(ranked), None)
-    text = None if said is None else said.model_dump(mode="json")
-    return {"name": name, "probability": share, "ranked": entry, "said": text, "sets": sets}
+    about = {"ranked": next(ranked, None), "said": said and said.model_dump(mode="json")}
+    return {"name": name, "probability": share, **about, "sets": sets}
 
 
 def _list_errors(results: Results, versions: Sequence[_Version]) -> Content:
@@ -338,12 +329,10 @@ def _list_errors(results: Results, versions: Sequence[_Version]) -> Content:
     ladder: Content = {}
     for axis in results.axes:
         errors = {n: one.axes[axis] for n, one in validated.items() if axis in one.axes}
-        if errors:
-            found = [errors.get(number) for number in range(len(versions))]
-            ladder[axis] = [
-                {"error": one and one.held_out_rmse, "floor": one and one.noise_floor}
-                for one in found
-            ]
+        found = [errors.get(number) for number in range(len(versions) if errors else 0)]
+        if found:
+            shown = ((one.held_out_rmse, one.noise_floor) if one else (None, None) for one in found)
+            ladder[axis] = [{"error": error, "floor": floor} for error, floor in shown]
     return ladder
 
 

@@ -16,22 +16,6 @@ _GAP_CODE = 65535
 _COMPRESSION = 6
 
 
-@dataclass(frozen=True)
-class PackedColumn:
-    """A column as the page holds it: ``low + step * code``, code 65535 for a gap.
-
-    Attributes:
-        block: number of the block of text; equal columns share one.
-        order: how many times differences were taken.
-        low, step: in the column's unit.
-    """
-
-    block: int
-    order: int
-    low: float
-    step: float
-
-
 @dataclass
 class Packer:
     """Packs columns and holds their text.
@@ -43,8 +27,13 @@ class Packer:
     blocks: list[str] = field(default_factory=list)
     _known: dict[bytes, int] = field(default_factory=dict, repr=False)
 
-    def pack(self, values: NDArray[np.float64]) -> PackedColumn:
-        """Return ``values``, NaN where a sample is missing, packed."""
+    def pack(self, values: NDArray[np.float64]) -> dict[str, float]:
+        """Return ``values``, NaN where a sample is missing, as the page reads them.
+
+        They are ``low + step * code`` in the column's unit, code 65535 for a gap. ``block`` is the
+        number of the block of text with the codes, which equal columns share, ``order`` how many
+        times differences of them were taken.
+        """
         finite = np.isfinite(values)
         low = float(values[finite].min()) if finite.any() else 0.0
         high = float(values[finite].max()) if finite.any() else 0.0
@@ -55,7 +44,8 @@ class Packer:
         twice = np.diff(once, prepend=once.dtype.type(0))
         both = [steps.view(np.int16) for steps in (once, twice)]
         order = int(np.argmin([np.abs(steps.astype(np.float64)).sum() for steps in both]))
-        return PackedColumn(self._add(_fold_bytes(both[order])), order + 1, low, step)
+        block = self._add(_fold_bytes(both[order]))
+        return {"block": block, "order": order + 1, "low": low, "step": step}
 
     def pack_times(self, seconds: NDArray[np.float64]) -> int:
         """Return the number of the block of ``seconds``: microseconds, differences taken twice."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from bampipe.report.document import Block, Table
 from bampipe.report.run_results import Results
-from bampipe.report.wording import format_decimals, format_digits, format_stated, format_unit
+from bampipe.report.wording import format_decimals, format_stated, format_unit
 from bampipe.results.identify import Combined, DeviceNumber, IdentifyResult
 from bampipe.results.performance import DeviceConstant, PerformanceResult
 
@@ -27,16 +27,11 @@ def _tabulate_constants(
     results: Results, constants: Mapping[str, DeviceConstant], together: Iterable[Combined]
 ) -> Table:
     grouped = {name for group in together for name in group.members}
-    order = sorted(constants, key=lambda name: (name in grouped, name.lower()))
-    rows = []
-    for name in order:
-        one = constants[name]
-        value, unit = format_stated(one.value), format_unit(one.unit) or "1"
-        rows.append((f"`{name}`", one.description, value, unit, one.source))
+    order = sorted(constants.items(), key=lambda item: (item[0] in grouped, item[0].lower()))
     return Table(
         f"Numbers of the device file, none of them estimated{results.cite_paper('Table II')}",
-        "Name | What ~1.6 | >Value | Unit | Source ~1.2",
-        rows,
+        "Name :code | What ~1.6 | >Value | Unit :unit | Source ~1.2",
+        [(n, c.description, format_stated(c.value), c.unit or "1", c.source) for n, c in order],
     ).drop_empty_columns()
 
 
@@ -47,11 +42,10 @@ def _tabulate_numbers(numbers: Iterable[DeviceNumber]) -> Table:
         moved = sorted(one.moves_percent.items(), key=lambda item: -abs(item[1]))[:2]
         most = [f"`{n}` {format_decimals(x, 2)} %" for n, x in moved if abs(x) >= _LEAST_PERCENT]
         value = f"{format_stated(one.value)} {format_unit(one.unit) or '1'}"
-        bound = format_digits(one.bound_sd, 2)
-        rows.append((f"`{one.name}`", value, bound, ", ".join(most) or "none by 0.01 %"))
+        rows.append((one.name, value, one.bound_sd, ", ".join(most) or "none by 0.01 %"))
     return Table(
         "Numbers of the device file on which the estimates depend",
-        "Number ~1.5 | >Value ~1 | >Least SD ~0.6 | An error of 1 % would move ~2",
+        "Number :code ~1.5 | >Value ~1 | >Least SD :2 ~0.6 | An error of 1 % would move ~2",
         rows,
         "Least SD: how well these trials could determine the number if it were estimated together "
         "with the parameters (Cramér-Rao bound).",

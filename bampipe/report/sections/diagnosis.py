@@ -19,14 +19,7 @@ from bampipe.report.document import (
 )
 from bampipe.report.run_results import Results
 from bampipe.report.sections import next_trial
-from bampipe.report.wording import (
-    format_decimals,
-    format_digits,
-    format_p_value,
-    format_percent,
-    format_unit,
-    split_name,
-)
+from bampipe.report.wording import format_decimals, format_digits, format_unit, split_name
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import (
     AxisVerdict,
@@ -48,25 +41,20 @@ _MOST_MAPS = 6
 
 def list_blocks(results: Results) -> Iterator[Block]:
     """Yield the findings of each diagnosis."""
-    found = [
-        (model, content)
-        for model in results.models
-        if (content := results.read(DiagnoseResult, model)) is not None
-    ]
+    every = (results.read(DiagnoseResult, model) for model in results.models)
+    found = [content for content in every if content is not None]
     if not found:
         yield Paragraph(f"No model has been diagnosed yet: run `{results.diagnose_command}`.")
-        return
-    last, after = found[-1]
-    for model, content in found:
+    for content in found:
         if len(found) > 1:
-            yield Subheading(f"Model `{model}`")
-        yield from _show_model(results, model, content, {} if model == last else after.maps)
+            yield Subheading(f"Model `{content.model}`")
+        yield from _show_model(results, content, {} if content is found[-1] else found[-1].maps)
 
 
 def _show_model(
-    results: Results, model: str, found: DiagnoseResult, later: Mapping[str, Maps]
+    results: Results, found: DiagnoseResult, later: Mapping[str, Maps]
 ) -> Iterator[Block]:
-    axes = results.order_axes(found.axes)
+    model, axes = found.model, results.order_axes(found.axes)
     yield Bullets(tuple(entry.sentence for entry in axes.values()))
     yield _tabulate_verdicts(found, axes)
     if limits := phrases.limits(found):
@@ -75,7 +63,7 @@ def _show_model(
     if found.ranking and lacking:
         yield _tabulate_ranking(found.ranking)
         yield from _tabulate_sets(found)
-    yield _advise(results, model, found) if lacking else _tell_sensitivity(results, model)
+    yield _advise(results, found) if lacking else _tell_sensitivity(results, model)
     if found.suggested_trial is not None:
         yield Callout("note", "A trial that would tell more", found.suggested_trial.sentence)
     for axis in lacking:
@@ -97,14 +85,13 @@ def _tell_sensitivity(results: Results, model: str) -> Paragraph:
     )
 
 
-def _advise(results: Results, model: str, found: DiagnoseResult) -> Paragraph:
+def _advise(results: Results, found: DiagnoseResult) -> Paragraph:
     """Return the next command, or its result if it has been run."""
-    compared = results.read(CompareResult)
-    wanted = set(found.selected)
+    compared, wanted = results.read(CompareResult), {*found.selected}
     for rung in compared.ladder if compared else ():
-        if wanted and rung.parent == model and wanted == set((rung.added or "").split(", ")):
+        if wanted and rung.parent == found.model and wanted == {*(rung.added or "").split(", ")}:
             return Paragraph(f"Added since, as model `{rung.model}`.")
-    if found.next.startswith("bampipe draft ") and results.read(DraftResult, model):
+    if found.next.startswith("bampipe draft ") and results.read(DraftResult, found.model):
         return Paragraph("Drafted since (under Drafts).")
     return results.state_next(found.next)
 
@@ -114,12 +101,11 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
     for axis, one in axes.items():
         errors = (one.rmse_before, one.rmse_after, one.rmse_beyond_bias, one.noise_floor)
         words, share = phrases.verdict(found, axis), phrases.percent_of_force(one.explained)
-        left = format_percent(one.explainable_share)
-        rows.append((axis, words, share, *map(format_digits, errors), format_unit(one.unit), left))
+        rows.append((axis, words, share, *errors, one.unit, one.explainable_share))
     return Table(
         "Verdict by axis",
-        "Axis | Verdict ~1 | >Explained | >Error now | >with the set | >beyond bias | >Floor | Unit"
-        " | >Explainable",
+        "Axis | Verdict ~1 | >Explained | >Error now | >with the set | >beyond bias | >Floor"
+        " | Unit :unit | >Explainable :%",
         rows,
         "Probabilities are in brackets. Explained: share of the mean square of the applied force "
         "that the model with the most probable set of effects explains. Errors are RMSE on "
@@ -134,13 +120,10 @@ def _tabulate_sets(found: DiagnoseResult) -> Iterator[Block]:
     """Yield the probable sets of effects, if there are several, and the null distribution."""
     shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
     if len(shown) > 1:
+        first = shown[0].log_evidence
         rows = [
-            (
-                phrases.name_set(one, "`"),
-                phrases.probability(one.probability),
-                format_digits(one.log_evidence - shown[0].log_evidence),
-            )
-            for one in shown[:_MOST_RANKED]
+            (phrases.name_set(s, "`"), phrases.probability(s.probability), s.log_evidence - first)
+            for s in shown[:_MOST_RANKED]
         ]
         columns = "Effects | >Probability | >Log evidence over the first (nats)"
         yield Table("Sets of effects, the most probable first", columns, rows)
@@ -158,16 +141,11 @@ def tabulate_candidates(
     """
     return Table(
         title,
-        f"Effect | {about} | >Without | >With | Unit | >Probability | >p",
+        f"Effect :code | {about} | >Without | >With | Unit :unit | >Probability | >p :p",
         [
             (
-                f"`{one.effect}`",
-                *more,
-                format_digits(one.held_out_rmse_before),
-                format_digits(one.held_out_rmse_after),
-                format_unit(one.unit),
-                phrases.probability(one.probability),
-                format_p_value(one.p_value),
+                *(one.effect, *more, one.held_out_rmse_before, one.held_out_rmse_after),
+                *(one.unit, phrases.probability(one.probability), one.p_value),
             )
             for one, more in rows
         ],
@@ -177,16 +155,14 @@ def tabulate_candidates(
 
 
 def _tabulate_ranking(ranking: Sequence[RankedEffect]) -> Table:
-    shown, more = ranking[:_MOST_RANKED], len(ranking) - _MOST_RANKED
     rows = [
-        (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from))) for one in shown
+        (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)))
+        for one in ranking[:_MOST_RANKED]
     ]
-    return tabulate_candidates(
-        "Candidate effects, best first",
-        rows,
-        "Axis | Indistinguishable from",
-        f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else "",
-    ).drop_empty_columns()
+    more = len(ranking) - _MOST_RANKED
+    note = f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else ""
+    title, about = "Candidate effects, best first", "Axis | Indistinguishable from"
+    return tabulate_candidates(title, rows, about, note).drop_empty_columns()
 
 
 def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Figure:
@@ -209,53 +185,36 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
 
 def draw_maps(panel: Any, name: str, shown: Sequence[tuple[ResidualMap, str, str]]) -> None:
     """Draw maps of one variable into a panel, each with its colour and its title."""
-    for one in shown:
-        _draw_map(panel, name, *one)
+    bands = []
+    for one, colour, title in shown:
+        mean, low, high = (np.array(values) for values in (one.mean, one.low, one.high))
+        bands += [low, high]
+        if one.unit or not all(value.is_integer() for value in one.center):
+            x, unit = style.scale_values(np.array(one.center), one.unit)
+            panel.fill_between(x, low, high, color=colour, alpha=0.2, lw=0)
+            panel.plot(x, mean, color=colour, lw=1.1, label=title)
+            panel.set_xlabel(style.label_axis(split_name(name), unit))
+        else:  # a discrete variable
+            signs = {-1: "−", 0: "0", 1: "+"} if name == "direction" else {}
+            numbers = [int(value) for value in one.center]
+            names = [signs.get(n, str(n + (name == "trial"))) for n in numbers]
+            places = np.arange(len(names), dtype=float)
+            spread = np.abs(np.vstack([mean - low, high - mean]))
+            panel.errorbar(places, mean, spread, color=colour, fmt="o", ms=3, lw=1.0, label=title)
+            panel.set_xticks(places, names)
+            panel.set(xlim=(-0.5, len(names) - 0.5), xlabel=split_name(name))
     panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
-    bands = [np.array(values) for one, _, _ in shown for values in (one.low, one.high)]
     style.set_limits(panel, bands, zero=True)
-
-
-def _draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str) -> None:
-    """Draw the mean residual with its band over one variable of a map."""
-    mean, low, high = (np.array(values) for values in (shown.mean, shown.low, shown.high))
-    values = None if shown.unit else _name_values(name, shown.center)
-    if values is None:
-        x, unit = style.scale_values(np.array(shown.center), shown.unit)
-        panel.fill_between(x, low, high, color=colour, alpha=0.2, lw=0)
-        panel.plot(x, mean, color=colour, lw=1.1, label=title)
-        panel.set_xlabel(style.label_axis(split_name(name), unit))
-        return
-    places = np.arange(len(values), dtype=float)
-    spread = np.abs(np.vstack([mean - low, high - mean]))
-    panel.errorbar(places, mean, spread, color=colour, fmt="o", ms=3, lw=1.0, label=title)
-    panel.set_xticks(places, values)
-    panel.set_xlim(-0.5, len(values) - 0.5)
-    panel.set_xlabel(split_name(name))
-
-
-def _name_values(name: str, centre: Sequence[float]) -> list[str] | None:
-    """Return the names of the values of a discrete variable, else None."""
-    if not all(value.is_integer() for value in centre):
-        return None
-    first = 1 if name == "trial" else 0
-    signs = {-1: "−", 0: "0", 1: "+"} if name == "direction" else {}
-    return [signs.get(int(value), str(int(value) + first)) for value in centre]
 
 
 def _tabulate_windows(windows: Sequence[WorstWindow]) -> Table:
     rows = [
         (
-            one.axis,
-            one.trial_id,
+            *(one.axis, one.trial_id),
             f"{format_decimals(one.t_start, 1)} to {format_decimals(one.t_end, 1)}",
-            f"{format_digits(one.rmse)} {format_unit(one.unit)}",
-            one.doing or "–",
+            *(f"{format_digits(one.rmse)} {format_unit(one.unit)}", one.doing or None),
         )
         for one in windows[:_MOST_WINDOWS]
     ]
-    return Table(
-        "Worst windows: where the prediction fails most, and how the machine moved there",
-        "Axis | Trial | Time (s) | >RMSE | Motion ~1",
-        rows,
-    )
+    title = "Worst windows: where the prediction fails most, and how the machine moved there"
+    return Table(title, "Axis | Trial | Time (s) | >RMSE | Motion ~1", rows)

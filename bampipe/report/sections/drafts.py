@@ -9,7 +9,7 @@ from bampipe.lists import join_names
 from bampipe.report import style
 from bampipe.report.document import Block, Figure, Formulas, Paragraph, Subheading, Table
 from bampipe.report.run_results import Results
-from bampipe.report.wording import format_digits, format_unit, split_name
+from bampipe.report.wording import split_name
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
 from bampipe.results.draft import AxisDraft, DraftedEffect, DraftResult
 
@@ -86,17 +86,14 @@ def _draw_curve(
     panel: Axes, name: str, effect: DraftedEffect, residual: ResidualMap | None
 ) -> None:
     curve = effect.curve
-    x, unit = style.scale_values(np.array(curve.at), curve.variable_unit)
     if residual is not None and effect.acts_as == "force":
         centre, _ = style.scale_values(np.array(residual.center), residual.unit)
         low, high, mean = (-np.array(v) for v in (residual.high, residual.low, residual.mean))
         panel.fill_between(centre, low, high, color=style.VERMILLION, alpha=0.2, lw=0)
         panel.plot(centre, mean, ".-", color=style.VERMILLION, ms=3.0, lw=0.8, label="residual")
-    panel.fill_between(x, curve.low, curve.high, color=style.BLUE, alpha=0.25, lw=0)
-    panel.plot(x, curve.mean, color=style.BLUE, label="draft")
-    panel.axhline(0.0, color=style.INK, lw=0.5)
+    band = (curve.at, curve.mean, curve.low, curve.high)
+    style.draw_curve(panel, band, curve.variable, curve.variable_unit, label="draft")
     panel.set_title(split_name(name.partition(":")[0]), fontsize="small")
-    panel.set_xlabel(style.label_axis(split_name(curve.variable), unit))
     kind = "torque" if curve.unit.startswith("N.m") else "force"
     panel.set_ylabel(style.label_axis(kind, curve.unit))
 
@@ -107,8 +104,7 @@ def _draw_length(panel: Axes, entry: AxisDraft) -> None:
     panel.plot(counts, errors, color=style.INK, marker="o", ms=3.5, lw=0.8)
     panel.axhline(entry.noise_floor, color=style.BLUE, lw=0.8)
     style.use_decades(panel, [*errors, entry.noise_floor])
-    panel.set_xticks(sorted(set(counts)))
-    panel.set_xlabel("constants")
+    panel.set(xticks=sorted(set(counts)), xlabel="constants")
     panel.set_ylabel(style.label_axis("held-out error", entry.unit))
 
 
@@ -123,15 +119,12 @@ def _draw_gains(panel: Axes, entry: AxisDraft) -> None:
     panel.set_yscale("symlog", linthresh=10.0)
     names = ["first formula", "second"][: len(entry.chance)]
     panel.set_xticks(range(len(names)), names)
-    panel.set_xlim(-0.5, len(names) - 0.2)
-    panel.set_ylabel("gain")
+    panel.set(xlim=(-0.5, len(names) - 0.2), ylabel="gain")
 
 
 def _tabulate_nearest(entry: AxisDraft) -> Table:
     errors = {"the draft": entry.rmse_after}
     errors |= {f"`{near.effect}`": near.held_out_rmse for near in entry.nearest}
-    return Table(
-        "Most similar effects of the library: error on held-out trials",
-        "Effect | >With it | Unit",
-        [(name, format_digits(x), format_unit(entry.unit)) for name, x in errors.items()],
-    )
+    title = "Most similar effects of the library: error on held-out trials"
+    rows = [(name, error, entry.unit) for name, error in errors.items()]
+    return Table(title, "Effect | >With it | Unit :unit", rows)

@@ -64,10 +64,9 @@ def _list_estimates(results: Results, term: ModelTerm) -> str:
     identified = results.read(IdentifyResult)
     known = identified.parameters if identified else {}
     shown = []
-    for name in term.parameters:
-        if one := known.get(name):
-            value = f"{format_with_sd(one.estimate, one.sd)} {format_unit(one.unit)}".rstrip()
-            shown.append(f"{split_name(name.rpartition('.')[2])} {value}")
+    for name, one in ((name, known[name]) for name in term.parameters if name in known):
+        value = f"{format_with_sd(one.estimate, one.sd)} {format_unit(one.unit)}".rstrip()
+        shown.append(f"{split_name(name.rpartition('.')[2])} {value}")
     return f"Found: {'; '.join(shown)}." if shown else ""
 
 
@@ -79,14 +78,10 @@ def _draw_curves(name: str, curves: Sequence[TermCurve], caption: str) -> Figure
 
 
 def _draw_curve(panel: Axes, curve: TermCurve) -> None:
-    x, unit = style.scale_values(np.array(curve.center), curve.variable_unit)
-    panel.fill_between(x, curve.low, curve.high, color=style.BLUE, alpha=0.25, lw=0)
-    panel.plot(x, curve.mean, color=style.BLUE, marker=".", ms=3.0)
-    panel.axhline(0.0, color=style.INK, lw=0.5)
-    panel.set_title(curve.axis)
-    panel.set_xlabel(style.label_axis(split_name(curve.variable), unit))
+    band = (curve.center, curve.mean, curve.low, curve.high)
+    style.draw_curve(panel, band, curve.variable, curve.variable_unit, marker=".", ms=3.0)
     kind = "torque" if curve.unit.startswith("N.m") else "force"
-    panel.set_ylabel(style.label_axis(f"{kind} taken", curve.unit))
+    panel.set(title=curve.axis, ylabel=style.label_axis(f"{kind} taken", curve.unit))
 
 
 def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator[Block]:
@@ -102,27 +97,22 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator
     shown.add(found.added)
     first = next((curve for curve in curves if curve.axis == found.window.axis), None)
     if first is None:
-        figure, panels = style.make_grid(2, 1, 1.35, extra=0.0)
-        top, bottom = panels
+        figure, (top, bottom) = style.make_grid(2, 1, 1.35, extra=0.0)
     else:
-        figure, (left, top, bottom) = style.split_figure(2, 2.7)
+        figure, (left, top, bottom) = style.split_figure(2.7)
         _draw_curve(left, first)
     unit = format_unit(results.force_unit(found.window.axis))
     errors = _draw_window(top, bottom, found, unit)
     before, after = (format_digits(error, 2) for error in errors)
-    change = (
-        f"the residual falls from {before} to {after} {unit} (RMSE)"
-        if errors[1] < errors[0]
-        else f"the residual does not fall ({before} and {after} {unit} RMSE)"
-    )
+    change = f"the residual does not fall ({before} and {after} {unit} RMSE)"
+    if errors[1] < errors[0]:
+        change = f"the residual falls from {before} to {after} {unit} (RMSE)"
+    beside = f"Left: {_describe_curves(term, [first])} Right: the" if first else "The"
     caption = (
-        f"he worst window of {found.window.axis} without {found.added} ({found.window.doing}), "
-        f"where {change}."
+        f"{beside} worst window of {found.window.axis} without {found.added} "
+        f"({found.window.doing}), where {change}."
     )
-    beside = (
-        f"Left: {_describe_curves(term, [first])} Right: t{caption}" if first else f"T{caption}"
-    )
-    yield style.finish(figure, name, beside, [top])
+    yield style.finish(figure, name, caption, [top])
     others = [curve for curve in curves if curve is not first]
     yield from _draw_contribution(f"{name}-more", term, others)
 
@@ -190,8 +180,7 @@ def _draw_window(top: Axes, bottom: Axes, found: _Window, unit: str) -> list[flo
         panel.axvspan(window.t_start, window.t_end, color=style.SKY, alpha=0.2, lw=0)
     top.tick_params(labelbottom=False)
     top.set_ylabel(style.label_axis(axis, unit))
-    bottom.set_ylabel(style.label_axis("residual", unit))
-    bottom.set_xlabel(f"time in {window.trial_id} (s)")
+    bottom.set(ylabel=style.label_axis("residual", unit), xlabel=f"time in {window.trial_id} (s)")
     return errors
 
 

@@ -75,15 +75,13 @@ def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:
         half = NORMAL_95 * sd
         rows.append(
             (
-                name_parameter(name),
-                f"`{name}`",
-                format_decimals(value, *digits) + (" *" if one.at_bound else ""),
-                format_digits(sd, 2) if sd else "fixed",
-                format_digits(one.calibration_sd or 0.0, 2) if calibrated else "",
-                "" if one.bound_sd is None else format_digits(one.bound_sd, 2),
-                format_interval(value - half, value + half, sd) if sd else "–",
+                *(name, name, format_decimals(value, *digits) + (" *" if one.at_bound else "")),
+                sd or "fixed",
+                (one.calibration_sd or 0.0) if calibrated else "",
+                "" if one.bound_sd is None else one.bound_sd,
+                format_interval(value - half, value + half, sd) if sd else None,
                 *(format_decimals(found[name].estimate, *digits) for found in others.values()),
-                format_unit(one.unit),
+                one.unit,
             )
         )
     note = f"Interval: estimate ± 1.96 standard deviations{_qualify_intervals(results)}."
@@ -102,8 +100,8 @@ def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:
     return Table(
         f"Parameters of model `{identified.model}`, {METHODS[identified.method]}"
         f"{results.cite_paper('Table VII')}",
-        "Parameter ~1.1 | Name ~1 | >Estimate | >SD | >Calibration | >Bound | >95 % interval"
-        f"{''.join(heads)} | Unit",
+        "Parameter :name ~1.1 | Name :code ~1 | >Estimate | >SD :2 | >Calibration :2 | >Bound :2"
+        f" | >95 % interval{''.join(heads)} | Unit :unit",
         rows,
         note,
     ).drop_empty_columns()
@@ -117,36 +115,28 @@ def _qualify_intervals(results: Results) -> str:
         for error in (validated.axes.values() if validated else ())
         if error.noise_floor and error.standing == "above_floor"
     ]
-    if not lacking:
-        return ""
-    return (
-        ", as if the model lacked nothing; its held-out error is up to "
-        f"{format_digits(max(lacking))} times the noise floor, and the missing effect may bias the "
-        "estimates by more than these intervals"
+    most = format_digits(max(lacking, default=0.0))
+    said = (
+        f", as if the model lacked nothing; its held-out error is up to {most} times the noise"
+        " floor, and the missing effect may bias the estimates by more than these intervals"
     )
+    return said if lacking else ""
 
 
 def _select_parameters(identified: IdentifyResult) -> Mapping[str, ParameterEstimate]:
     """Return all but a robot's inertial numbers, of which motion determines only combinations."""
-    inertial, found = identified.inertial, identified.parameters
-    return {name: one for name, one in found.items() if name not in inertial}
+    return {n: one for n, one in identified.parameters.items() if n not in identified.inertial}
 
 
 def _tabulate_combinations(bases: Sequence[BaseEstimate]) -> Table:
-    rows = [
-        (
-            base.combination,
-            format_decimals(base.estimate, *find_digits(base.estimate, base.sd)),
-            format_digits(base.sd, 2),
-            format_with_sd(base.drawn, base.drawn_sd),
-            "yes" if base.shown else "no",
-            format_unit(base.unit),
-        )
-        for base in bases
-    ]
+    rows = []
+    for one in bases:
+        estimate = format_decimals(one.estimate, *find_digits(one.estimate, one.sd))
+        drawn = (one.drawn, one.drawn_sd)
+        rows.append((one.combination, estimate, one.sd, drawn, one.shown, one.unit))
     return Table(
         "Combinations of inertial numbers that motion determines",
-        "Combination ~3 | >Estimate | >SD | >Drawing | Shown | Unit",
+        "Combination ~3 | >Estimate | >SD :2 | >Drawing | Shown | Unit :unit",
         rows,
         "Shown: whether its SD is less than half of that of the drawing.",
     )
@@ -173,13 +163,12 @@ def _list_checks(identified: IdentifyResult) -> str:
             "right."
         )
     lag, sd = 1e3 * timing.estimate, 1e3 * timing.sd  # ms; 0 where it was not estimated
-    if sd > 0.0 and abs(lag) < NORMAL_95 * sd:
+    verb = "lags" if lag > 0.0 else "leads"
+    text = f"The force {verb} the encoders by {format_with_sd(abs(lag), sd)} ms."
+    if abs(lag) < NORMAL_95 * sd:
         shown = f"(the force lags by {format_with_sd(lag, sd)} ms)"
-        parts.append(f"No delay between force and encoders is shown {shown}.")
-    elif sd > 0.0:
-        verb = "lags" if lag > 0.0 else "leads"
-        parts.append(f"The force {verb} the encoders by {format_with_sd(abs(lag), sd)} ms.")
-    return " ".join(parts)
+        text = f"No delay between force and encoders is shown {shown}."
+    return " ".join([*parts, *([text] if sd > 0.0 else [])])
 
 
 def _tabulate_states(results: Results, bounds: Mapping[str, StateBound]) -> Table:

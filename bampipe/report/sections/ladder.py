@@ -14,8 +14,6 @@ from bampipe.report.wording import (
     format_decimals,
     format_digits,
     format_unit,
-    format_with_sd,
-    name_parameter,
     split_name,
 )
 from bampipe.results.compare import CompareResult, Rung, Value, horizons_of
@@ -84,11 +82,10 @@ def _tabulate_free_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
     )
     rows = []
     for number, rung in enumerate(rungs):
-        cells = []
+        cells: list[float | None] = []
         for axis, (factor, _) in scales.items():
             one = runs[axis][number]
-            cells.append(format_digits(factor * one.mean_absolute if one else None))
-            cells.append(format_digits(one.relative_error_percent if one else None))
+            cells += [factor * one.mean_absolute, one.relative_error_percent] if one else [None] * 2
         rows.append((_name_version(rungs, rung), split_name(rung.free_run_mode or NONE), *cells))
     heads = (f">{axis} ({unit}) | >relative (%)" for axis, (_, unit) in scales.items())
     reasons = (
@@ -146,11 +143,9 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
             style.use_decades(panel, both)
         else:
             panel.set_ylim(0.0, 1.1 * both.max(initial=0.0) or 1.0)
-        panel.set_xlim(-0.4, len(rungs) - 0.6)
         panel.set_xticks(x, _name_ticks(rungs[0].model, error))
-        panel.set_xlabel("version, and its error")
-        panel.set_title(axis)
-        panel.set_ylabel(style.label_axis("RMSE", results.force_unit(axis)))
+        panel.set(xlim=(-0.4, len(rungs) - 0.6), xlabel="version, and its error")
+        panel.set(title=axis, ylabel=style.label_axis("RMSE", results.force_unit(axis)))
     return style.finish(figure, "ladder", _describe_change(rungs, axes), panels[:1])
 
 
@@ -171,11 +166,11 @@ def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
         before, after = (rung.held_out_rmse.get(axis) for rung in (rungs[0], rungs[-1]))
         if before and after:
             change = 100.0 * (after / before - 1.0)
-            verb = "falls" if change <= -1.0 else "rises" if change >= 1.0 else ""
             # A fall by 100 % would leave nothing.
             decimals = max(0, int(np.ceil(-np.log10(100.0 * after / before))))
-            size = format_decimals(abs(change), decimals)
-            parts.append(f"{axis} {verb} by {size} %" if verb else f"{axis} does not change")
+            size = f"{format_decimals(abs(change), decimals)} %"
+            verb = f"{'falls' if change < 0.0 else 'rises'} by {size}"
+            parts.append(f"{axis} {verb if abs(change) >= 1.0 else 'does not change'}")
     changes = f": {join_names(parts)}" if parts else ""
     return f"Error on held-out trials by version, against the noise floor{changes}."
 
@@ -192,11 +187,11 @@ def _tabulate_parameters(
     for name in results.order_parameters(parameters):
         values = [parameters[name].get(rung.model) for rung in shown]
         unit = next((one.unit for one in values if one), "")
-        cells = [format_with_sd(one.estimate, one.sd) if one else NONE for one in values]
-        rows.append((name_parameter(name), *cells, format_unit(unit)))
+        rows.append((name, *((one.estimate, one.sd) if one else None for one in values), unit))
+    heads = (f">{_name_version(rungs, rung)}" for rung in shown)
     return Table(
         "Parameters of each version (± one standard deviation): a missing effect biases the others",
-        " | ".join(("Parameter", *(f">{_name_version(rungs, rung)}" for rung in shown), "Unit")),
+        " | ".join(("Parameter :name", *heads, "Unit :unit")),
         rows,
-        "–: not in that version." if any(NONE in row for row in rows) else "",
+        "–: not in that version." if any(None in row for row in rows) else "",
     )

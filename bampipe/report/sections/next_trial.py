@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
 from bampipe.report.document import Block, Bullets, Callout, Paragraph, Table
 from bampipe.report.run_results import Results
-from bampipe.report.wording import format_digits, format_percent, format_unit
+from bampipe.report.wording import format_digits
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import Detectable, ExpectedSd, NextResult, PlannedConfusion, PlannedSd
@@ -20,16 +20,18 @@ def list_blocks(results: Results) -> Iterator[Block]:
         return
     yield Callout("note", "The next trial", found.sentence)
     yield Paragraph(f"{found.why} {found.expected}")
-    if identified := results.read(IdentifyResult):
-        forecasts = read_forecasts(results.root, results.model)
+    forecasts, identified = (
+        read_forecasts(results.root, results.model),
+        results.read(IdentifyResult),
+    )
+    if identified is not None:
         lines = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
         if lines:
             yield Bullets(tuple(one.replace("RUN", results.root.name) for one in lines))
     best = found.proposals[0]
     if best.confusion:
-        title = "Probability of confusing two effects"
-        heads = ">with the present trials | >with the next one"
-        yield tabulate_confusion(title, heads, best.confusion)
+        heads = ("with the present trials", "with the next one")
+        yield tabulate_confusion("Probability of confusing two effects", heads, best.confusion)
     if best.sd:
         title = "Standard deviation of each parameter, now and with the next trial"
         yield tabulate_sds(title, best.sd)
@@ -37,17 +39,12 @@ def list_blocks(results: Results) -> Iterator[Block]:
         yield _tabulate_sensitivity(found.sensitivity)
 
 
-def tabulate_confusion(title: str, heads: str, pairs: Sequence[PlannedConfusion]) -> Table:
+def tabulate_confusion(
+    title: str, heads: tuple[str, str], pairs: Sequence[PlannedConfusion]
+) -> Table:
     """Tabulate the probability of confusing two effects, without and with new trials."""
-    rows = [
-        (
-            " or ".join(f"`{name}`" for name in pair.between),
-            format_percent(pair.before),
-            format_percent(pair.after),
-        )
-        for pair in pairs
-    ]
-    return Table(title, f"Effects | {heads}", rows)
+    rows = [(" or ".join(f"`{n}`" for n in p.between), p.before, p.after) for p in pairs]
+    return Table(title, f"Effects | >{heads[0]} :% | >{heads[1]} :%", rows)
 
 
 def tabulate_sds(title: str, entries: Mapping[str, ExpectedSd]) -> Table:
@@ -60,27 +57,27 @@ def tabulate_sds(title: str, entries: Mapping[str, ExpectedSd]) -> Table:
     for name, one in entries.items():
         values = (one.after,) if one.is_sharp else (one.low, one.high)
         expected = " to ".join(format_digits(value, 2) for value in values)
-        asked = format_digits(one.asked, 2) if isinstance(one, PlannedSd) else ""
-        before = format_digits(one.before, 2)
-        rows.append((f"`{name}`", before, expected, asked, format_unit(one.unit)))
+        asked = one.asked if isinstance(one, PlannedSd) else ""
+        rows.append((name, one.before, expected, asked, one.unit))
     note = "A range is given where one number cannot be trusted: eight of ten results lie in it."
     wide = not all(one.is_sharp for one in entries.values())
-    columns = "Parameter | >now | >expected | >asked | Unit"
+    columns = "Parameter :code | >now :2 | >expected | >asked :2 | Unit :unit"
     return Table(title, columns, rows, note if wide else "").drop_empty_columns()
 
 
 def _tabulate_sensitivity(table: Mapping[str, Detectable]) -> Table:
-    def factor(one: Detectable) -> float:
-        return float("inf") if one.smallest is None else one.smallest / one.typical
+    def factor(pair: tuple[str, Detectable]) -> float:
+        return float("inf") if pair[1].smallest is None else pair[1].smallest / pair[1].typical
 
     rows = []
-    for name, one in sorted(table.items(), key=lambda pair: -factor(pair[1])):
-        strength = f"`{one.parameter.rpartition('.')[2]}`"
-        sizes = (format_digits(x, 2) for x in (one.smallest, one.with_proposal, one.typical))
-        rows.append((f"`{name}`", one.axis or "–", strength, *sizes, format_unit(one.unit) or "1"))
+    for name, one in sorted(table.items(), key=factor, reverse=True):
+        sizes = (one.smallest, one.with_proposal, one.typical)
+        strength = one.parameter.rpartition(".")[2]
+        rows.append((name, one.axis or None, strength, *sizes, one.unit or "1"))
     return Table(
         "The smallest strength of each effect that these trials would have revealed",
-        "Effect | Axis | Strength | >now | >with the next | >typical | Unit",
+        "Effect :code | Axis | Strength :code | >now :2 | >with the next :2 | >typical :2"
+        " | Unit :unit",
         rows,
         "With 90 % probability, for the typical shape of the effect. A dash: such trials do not "
         "reveal it at any size, or the model's own parameters imitate it. Typical: the strength at "

@@ -5,6 +5,7 @@ the machine are in ``run.json``, and ``bampipe status`` prints them.
 """
 
 from collections.abc import Iterator, Mapping
+from itertools import groupby
 
 from bampipe.report.document import Block, Paragraph, Subheading, Table
 from bampipe.report.run_results import Results
@@ -24,9 +25,9 @@ def list_blocks(results: Results) -> Iterator[Block]:
     yield Paragraph(_list_versions(stages))
     if "ingest" in stages:
         read = stages["ingest"].inputs
-        rows = [(f"`{name}`", f"`{digest[:_DIGITS]}`") for name, digest in read.items()]
+        rows = [(name, digest[:_DIGITS]) for name, digest in read.items()]
         title = f"Files that were read (first {_DIGITS} digits of their hash)"
-        yield Table(title, "File | Hash", rows)
+        yield Table(title, "File :code | Hash :code", rows)
     yield _tabulate_stages(stages)
     if settings := _tabulate_settings(stages):
         yield Subheading("Settings")
@@ -34,24 +35,18 @@ def list_blocks(results: Results) -> Iterator[Block]:
 
 
 def _list_versions(stages: Mapping[str, StepRecord]) -> str:
-    found: dict[str, set[str]] = {}
-    for made in stages.values():
-        for name, version in made.versions.items():
-            found.setdefault(name, set()).add(version)
-    shown = ", ".join(f"{name} {' and '.join(sorted(found[name]))}" for name in sorted(found))
+    every = sorted({pair for made in stages.values() for pair in made.versions.items()})
+    names = groupby(every, key=lambda pair: pair[0])
+    shown = ", ".join(f"{n} {' and '.join(version for _, version in some)}" for n, some in names)
     text = f"Made with {shown}. " if shown else ""
     return f"{text}Full hashes are in `run.json`; equal inputs and versions give equal results."
 
 
 def _tabulate_stages(stages: Mapping[str, StepRecord]) -> Table:
-    rows = [
-        (f"`{name}`", str(len(made.outputs)), f"`{made.key[:_DIGITS]}`")
-        for name, made in _order_stages(stages)
-    ]
     return Table(
         "Stages",
-        "Stage | >Files | Key",
-        rows,
+        "Stage :code | >Files | Key :code",
+        [(n, str(len(made.outputs)), made.key[:_DIGITS]) for n, made in _order_stages(stages)],
         "Key: hash of everything on which the stage depends (inputs, settings, code, versions). "
         "`bampipe status` says when each ran, and for how long.",
     )

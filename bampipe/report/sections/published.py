@@ -26,13 +26,12 @@ def list_blocks(results: Results) -> Iterator[Block]:
     for row in paper["rows"]:
         value, sd = _read_number(results, row, "value"), _read_number(results, row, "sd")
         shown = format_digits(value) if sd is None else format_with_sd(value, sd)
-        place = (row["quantity"], row["place"], row["published"])
-        rows.append((*place, shown, format_unit(row["unit"])))
+        rows.append((row["quantity"], row["place"], row["published"], shown, row["unit"]))
     if results.session.simulated:
         yield _SIMULATED
     yield Table(
         f"{paper['title']}: published values and those of this session",
-        "Quantity | Place | >Paper | >This session | Unit",
+        "Quantity | Place | >Paper | >This session | Unit :unit",
         rows,
         f"Paper: digits as printed there.{_explain_dash(rows)}",
     )
@@ -88,13 +87,10 @@ def _read_number(results: Results, place: dict[str, Any], key: str) -> float | N
 
 def _find(content: Any, dotted: str) -> float | None:
     """Return the number at a dotted place; keys may hold dots themselves."""
-    if not dotted:
-        return float(content) if isinstance(content, int | float) else None
     if not isinstance(content, dict):
+        return float(content) if isinstance(content, int | float) and not dotted else None
+    keys = [key for key in content if f"{dotted}.".startswith(f"{key}.")]
+    if not keys:
         return None
-    parts = dotted.split(".")
-    for length in range(len(parts), 0, -1):
-        key = ".".join(parts[:length])
-        if key in content:
-            return _find(content[key], ".".join(parts[length:]))
-    return None
+    longest = max(keys, key=len)
+    return _find(content[longest], dotted[len(longest) + 1 :])

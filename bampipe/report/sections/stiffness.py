@@ -9,14 +9,7 @@ import pandas as pd
 from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
 from bampipe.report.run_results import Results
-from bampipe.report.wording import (
-    choose_scale,
-    format_digits,
-    format_percent,
-    format_scaled,
-    format_with_sd,
-    split_name,
-)
+from bampipe.report.wording import choose_scale, format_scaled, format_with_sd, split_name
 from bampipe.results.stiffness import AxisStiffness, GearStiffness, StiffnessResult
 
 TITLE = "Stiffness"
@@ -25,9 +18,9 @@ TITLE = "Stiffness"
 def list_blocks(results: Results) -> Iterator[Block]:
     """Yield the stiffness of axes and gears; nothing for a session without locked trials."""
     found = results.read(StiffnessResult)
+    if found is None and (results.trials["kind"] == "locked").any():
+        yield results.state_undone("The locked trials have not been used", "stiffness")
     if found is None:
-        if (results.trials["kind"] == "locked").any():
-            yield results.state_undone("The locked trials have not been used", "stiffness")
         return
     axes, notes = found.axes, found.notes
     if not axes and not found.gears:
@@ -48,17 +41,11 @@ def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table
     rows = []
     poses: dict[str, str] = {}
     for axis, one in results.order_axes(axes).items():
-        rows.append(
-            (
-                axis,
-                format_scaled(one.stiffness, one.unit, sd=one.sd),
-                str(one.n_cycles),
-                format_scaled(one.loop_width, one.loop_width_unit, 3),
-                format_scaled(one.energy_per_cycle, one.energy_unit, 3),
-                format_digits(one.bandwidth_rad_s),
-                format_digits(one.bandwidth_hz),
-            )
-        )
+        stiffness = format_scaled(one.stiffness, one.unit, sd=one.sd)
+        width = format_scaled(one.loop_width, one.loop_width_unit, 3)
+        loss = format_scaled(one.energy_per_cycle, one.energy_unit, 3)
+        bandwidth = (one.bandwidth_rad_s, one.bandwidth_hz)
+        rows.append((axis, stiffness, str(one.n_cycles), width, loss, *bandwidth))
         pose = results.order_axes(one.poses.get(one.bandwidth_pose, {}))
         parts = ", ".join(f"{name} {x:.3g} {results.unit(name)}" for name, x in pose.items())
         words = split_name(one.bandwidth_pose) + (f" ({parts})" if parts else "")
@@ -87,10 +74,10 @@ def _tabulate_gears(results: Results, gears: Mapping[str, GearStiffness]) -> Tab
         if gear.play is not None and gear.play_sd is not None:
             play = format_scaled(gear.play, gear.play_unit, sd=gear.play_sd)
         late = f"{format_with_sd(1e3 * gear.late_s, 1e3 * gear.late_sd)} ms"
-        rows.append((axis, stiffness, play, format_percent(gear.explained), late, gear.side))
+        rows.append((axis, stiffness, play, gear.explained, late, gear.side))
     return Table(
         "Gears with an encoder on either side",
-        "Axis | >Stiffness ~1.3 | >Play ~1.3 | >Explained ~0.8 | >Read late by ~1"
+        "Axis | >Stiffness ~1.3 | >Play ~1.3 | >Explained :% ~0.8 | >Read late by ~1"
         " | Second encoder ~1",
         rows,
         "From the difference of the encoders against the load of the drive, less the drive's own"
@@ -128,6 +115,5 @@ def _draw_loop(
         factor * line / stiffness, middle + line,
         color=style.VERMILLION, ls=(0, (4, 2)), lw=1.2, label="stiffness",
     )  # fmt: skip
-    panel.set_title(axis)
-    panel.set_xlabel(style.label_axis("deflection", unit))
+    panel.set(title=axis, xlabel=style.label_axis("deflection", unit))
     panel.set_ylabel(style.label_axis(results.name_force(axis), results.force_unit(axis)))

@@ -96,13 +96,11 @@ def _describe_ladder(results: Results) -> str:
         return ""
     first = compared.ladder[0]
     number = [rung.model for rung in compared.ladder].index(results.model)
-    last = compared.ladder[number]
-    if last is first:
-        return _explain_rejection(results, compared)
-    changes = []
+    if number == 0:
+        return _explain_rejection(compared)
+    last, changes = compared.ladder[number], []
     for axis, before in results.order_axes(first.held_out_rmse).items():
-        after = last.held_out_rmse.get(axis)
-        floor = last.noise_floor.get(axis)
+        after, floor = last.held_out_rmse.get(axis), last.noise_floor.get(axis)
         if after is not None:
             unit = format_unit(results.force_unit(axis))
             text = f"{axis} {format_digits(before)} to {format_digits(after)} {unit}"
@@ -113,7 +111,7 @@ def _describe_ladder(results: Results) -> str:
     )
 
 
-def _explain_rejection(results: Results, compared: CompareResult) -> str:
+def _explain_rejection(compared: CompareResult) -> str:
     """Say why no later version is accepted, although one may have a lower error."""
     first = compared.ladder[0]
     better = [rung for rung in compared.ladder if rung.has_lower_error_than(first)]
@@ -134,7 +132,7 @@ def _tabulate_numbers(results: Results) -> Table | None:
     identified = identify.parameters if identify else {}
     validated = validate.axes if validate else {}
     stiff = stiffness.axes if stiffness else {}
-    columns = []
+    rows: dict[str, list[str]] = {}
     for axis in results.axes:
         error, locked = validated.get(axis), stiff.get(axis)
         fit = error.fit_percent if error else None
@@ -145,13 +143,14 @@ def _tabulate_numbers(results: Results) -> Table | None:
             "Noise floor": _format_error(error, "noise_floor"),
             "Error without friction terms": _format_error(error, "rmse_without_friction"),
             "Fit": NONE if fit is None else f"{format_decimals(fit, 1)} %",
-            "Stiffness, brake locked": format_scaled(locked.stiffness, locked.unit, sd=locked.sd)
-            if locked
-            else NONE,
+            "Stiffness, brake locked": NONE,
         }
-        columns.append(cells)
-    rows = [_share_unit(title, [cells[title] for cells in columns]) for title in columns[0]]
-    rows = [row for row in rows if any(cell != NONE for cell in row[1:])]
+        if locked:
+            shown = format_scaled(locked.stiffness, locked.unit, sd=locked.sd)
+            cells["Stiffness, brake locked"] = shown
+        for title, cell in cells.items():
+            rows.setdefault(title, []).append(cell)
+    rows = {title: cells for title, cells in rows.items() if {*cells} != {NONE}}
     if not rows:
         return None
     held_out = f"Held-out: {verdicts.describe_held_out(validate)}. {_TERMS}" if validate else ""
@@ -159,7 +158,7 @@ def _tabulate_numbers(results: Results) -> Table | None:
     return Table(
         "Key numbers (± one standard deviation)",
         " | ".join(("", *(f">{axis} ~1" for axis in results.axes))),
-        rows,
+        [_share_unit(*row) for row in rows.items()],
         " ".join(filter(None, notes)),
     )
 
@@ -202,5 +201,5 @@ def _list_others(results: Results, parameters: Mapping[str, ParameterEstimate]) 
     others = [name for name in named if not name.startswith(_FRICTION)]
     if len(others) > _MOST_OTHERS:  # a robot's bodies
         return f"{count_noun(len(others), 'other parameter')} under Identification."
-    shown = [f"{name_parameter(name)}: {_format_estimate(parameters[name])}" for name in others]
-    return "; ".join(shown) + "." if shown else ""
+    shown = (f"{name_parameter(name)}: {_format_estimate(parameters[name])}" for name in others)
+    return "; ".join(shown) + "." * bool(others)

@@ -11,7 +11,6 @@ from bampipe.phrases import results as phrases
 from bampipe.report.document import Block, Paragraph, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
-    NONE,
     format_decimals,
     format_digits,
     format_scaled,
@@ -48,12 +47,10 @@ def _describe_sampling(results: Results) -> str:
     grid = session.sample_rate_hz
     read = results.trials[results.trials["n_samples"] > 1]
     rate = float(((read["n_samples"] - 1) / read["duration_s"]).median())
-    text = f"Sampled at {format_decimals(grid, 0)} Hz."
+    text = f"{format_decimals(grid, 0)} Hz"
     if math.isfinite(rate) and abs(rate - grid) > _SAME_RATE * grid:
-        text = (
-            f"Sampled at {format_digits(rate)} Hz on average, put on a grid of "
-            f"{format_decimals(grid, 0)} Hz when filtered."
-        )
+        text = f"{format_digits(rate)} Hz on average, put on a grid of {text} when filtered"
+    text = f"Sampled at {text}."
     if noise := session.force.noise_sd:
         each = join_names(f"{name} {format_digits(sd, 2)}" for name, sd in noise.items())
         text += f" Noise of a sample: {each} {format_unit(session.force.unit)}."
@@ -84,16 +81,11 @@ def _tabulate_trials(results: Results) -> Table:
         state, seconds = name_trial_state(str(row["status"])), row["duration_s"]
         # A trial that was set aside before it was read has no duration.
         is_known = isinstance(seconds, float) and math.isfinite(seconds)
-        rows.append(
-            (
-                str(row["trial_id"]),
-                _describe_kind(row),
-                format_decimals(seconds, 1) if is_known else NONE,
-                str(int(row["n_samples"])) if row["n_samples"] else NONE,
-                f"**{state}**" if row["status"] == "set_aside" else state,
-                "; ".join(left) or ("below" if own else "none"),
-            )
-        )
+        duration = format_decimals(seconds, 1) if is_known else None
+        count = str(int(row["n_samples"])) if row["n_samples"] else None
+        state = f"**{state}**" if row["status"] == "set_aside" else state
+        said = "; ".join(left) or ("below" if own else "none")
+        rows.append((str(row["trial_id"]), _describe_kind(row), duration, count, state, said))
     columns = "Trial | Kind | >Duration (s) | >Samples | State | Repairs, reason ~1"
     note = " ".join(_merge_remarks(remarks, pattern) for pattern in shared)
     return Table("Trials", columns, rows, note)
@@ -141,17 +133,11 @@ def _describe_filter(results: Results, filtered: FilterResult) -> Iterator[Block
     if stretches:
         title = "Stretches that no estimate and no error uses"
         yield Table(title, "Trial ~1 | Time (s) ~1 | Why ~6", stretches)
-    rows = [
-        (
-            axis,
-            format_scaled(one.resolution, one.unit),
-            format_digits(one.bandwidth_hz),
-            format_scaled(one.position_sd, one.unit),
-            format_scaled(one.velocity_sd, f"{one.unit}/s"),
-            format_scaled(one.acceleration_sd, f"{one.unit}/s2"),
-        )
-        for axis, one in results.order_axes(filtered.axes).items()
-    ]
+    rows = []
+    for axis, one in results.order_axes(filtered.axes).items():
+        sds = ((one.position_sd, ""), (one.velocity_sd, "/s"), (one.acceleration_sd, "/s2"))
+        shown = (format_scaled(sd, one.unit + per) for sd, per in sds)
+        rows.append((axis, format_scaled(one.resolution, one.unit), one.bandwidth_hz, *shown))
     if rows:
         title = "Encoders and the motion derived from them: typical standard deviations of error"
         columns = (

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 from bampipe.report.document import Block, Bullets, Paragraph, Table
 from bampipe.report.run_results import Results
-from bampipe.report.wording import format_decimals, format_digits, format_percent, format_unit
+from bampipe.report.wording import format_decimals
 from bampipe.results.identify import IdentifiabilityReport, IdentifyResult, InnovationTests
 
 TITLE = "Trust in the estimates"
@@ -21,30 +21,24 @@ def list_blocks(results: Results) -> Iterator[Block]:
             yield Bullets(known.sentences)
         yield _tabulate_bounds(results, identified, known)
         if len(known.trials) > 1:
-            rows = [
-                (name, format_percent(one.growth), f"`{one.parameter}`")
-                for name, one in known.trials.items()
-            ]
+            rows = [(name, one.growth, one.parameter) for name, one in known.trials.items()]
             caption = "Growth of a bound without each trial, for the parameter that needs it most"
-            yield Table(caption, "Trial | >Growth | Parameter", rows)
+            yield Table(caption, "Trial | >Growth :% | Parameter :code", rows)
     if identified.innovations:
         is_published = identified.method == "ukf"
         yield _tabulate_innovations(results, identified.innovations, is_published)
 
 
 def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
+    words = (
+        "No two parameters are confounded in these trials. The remaining limits follow from the "
+        "equations and from the numbers of the device file."
+    )
+    if identified.base_parameters:
+        words = "The motion of a robot determines only combinations of its inertial numbers"
+        words += " (under Identification)."
     if known.weak_directions:
         words = "Some parameters are known less well than their intervals suggest."
-    elif identified.base_parameters:
-        words = (
-            "The motion of a robot determines only combinations of its inertial numbers (under "
-            "Identification)."
-        )
-    else:
-        words = (
-            "No two parameters are confounded in these trials. The remaining limits follow from "
-            "the equations and from the numbers of the device file."
-        )
     if identified.inertial:
         words += (
             " A single inertial number depends on the drawing, however small its standard "
@@ -60,15 +54,15 @@ def _tabulate_bounds(
     rows = []
     for name in results.order_parameters(known.parameters.keys() - identified.inertial):
         bound, found = known.parameters[name], identified.parameters[name]
-        partner = "–"
+        partner = None
         if bound.correlation is not None:
             partner = f"`{bound.partner}` {format_decimals(bound.correlation, 2)}"
-        sds = (format_digits(x, 2) for x in (found.sd, bound.bound_sd, bound.alone_sd))
-        bias = format_digits(found.least_squares_bias, 2)
-        rows.append((f"`{name}`", *sds, partner, bias, format_unit(found.unit) or "1"))
+        sds = (found.sd, bound.bound_sd, bound.alone_sd)
+        rows.append((name, *sds, partner, found.least_squares_bias, found.unit or "1"))
     return Table(
         "Standard deviation of each estimate beside the least possible",
-        "Parameter | >SD | >Bound | >Alone | Correlated with | >Bias of filtering | Unit",
+        "Parameter :code | >SD :2 | >Bound :2 | >Alone :2 | Correlated with"
+        " | >Bias of filtering :2 | Unit :unit",
         rows,
         "Bound: Cramér-Rao, the least that sensor noise allows on these trials. Alone: the same"
         " if all others were known. Correlated with: the parameter whose error is most"
@@ -84,17 +78,10 @@ def _tabulate_innovations(
     """Tabulate the tests, in words only where the filter's parameters are those published."""
     rows = []
     for axis, entry in results.order_axes(tests).items():
-        own, driven = entry.whiteness, entry.inputs
-        rows.append(
-            (
-                axis,
-                _tell_outcome(own.white if own else None),
-                format_percent(own.share if own else None),
-                _tell_outcome(driven.independent if driven else None),
-                format_percent(driven.share if driven else None),
-                entry.sentence if is_published else "",
-            )
-        )
+        own, inputs = entry.whiteness, entry.inputs
+        white = (_tell_outcome(own.white), own.share) if own else (None, None)
+        driven = (_tell_outcome(inputs.independent), inputs.share) if inputs else (None, None)
+        rows.append((axis, *white, *driven, entry.sentence if is_published else ""))
     note = (
         "White: Ljung-Box over one second. Inputs: regression on the inputs up to half a second "
         "back. Share: of the variance that is predictable beyond chance."
@@ -105,11 +92,11 @@ def _tabulate_innovations(
         )
     return Table(
         "Innovations of the filter",
-        "Axis | White | >Share | Inputs | >Share | In words ~1",
+        "Axis | White | >Share :% | Inputs | >Share :% | In words ~1",
         rows,
         note,
     ).drop_empty_columns()
 
 
-def _tell_outcome(passed: bool | None) -> str:
-    return "–" if passed is None else ("passes" if passed else "**fails**")
+def _tell_outcome(passed: bool) -> str:
+    return "passes" if passed else "**fails**"

@@ -56,17 +56,16 @@ def list_blocks(results: Results) -> Iterator[Block]:
 def _tabulate_axes(results: Results, validated: ValidateResult) -> Table:
     rows = []
     for axis, one in results.order_axes(validated.axes).items():
-        fit = NONE if one.fit_percent is None else format_decimals(one.fit_percent, 1)
+        fit = None if one.fit_percent is None else format_decimals(one.fit_percent, 1)
         errors = (one.held_out_rmse, one.noise_floor, one.rmse, one.rmse_without_friction)
-        rows.append((axis, *map(format_digits, errors), fit, format_unit(one.unit)))
+        rows.append((axis, *errors, fit, one.unit))
     bands = {axis: f"at {format_digits(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()}
-    each = join_names(f"{axis} {band}" for axis, band in bands.items())
-    if len(set(bands.values())) == 1:
-        each = next(iter(bands.values()))
+    different = {*bands.values()}
+    each = join_names(map(" ".join, bands.items())) if len(different) != 1 else different.pop()
     return Table(
         f"Error of the predicted force, model `{validated.model}`",
         "Axis | >Held-out RMSE ~1 | >Noise floor ~1 | >RMSE, all trials ~1"
-        " | >RMSE without friction ~1.2 | >Fit (%) ~0.6 | Unit",
+        " | >RMSE without friction ~1.2 | >Fit (%) ~0.6 | Unit :unit",
         rows,
         f"Held out: {verdicts.describe_held_out(validated)}. Noise floor: the error that sensor "
         "noise, quantisation and filtering alone would leave. Fit: share of the measured force "
@@ -81,9 +80,9 @@ def _tabulate_trials(results: Results, validated: ValidateResult) -> Table:
         key = "held_out_rmse" if trial.held_out else "rmse"
         # Zero: the axis rested, no sample counts.
         errors = (getattr(trial.axes.get(axis), key, None) or None for axis in results.axes)
-        rows.append((name, "yes" if trial.held_out else "no", *map(format_digits, errors)))
+        rows.append((name, trial.held_out, *errors))
     heads = (f">{axis} ({format_unit(results.force_unit(axis))})" for axis in results.axes)
-    note = "–: the axis rested." if any(NONE in row for row in rows) else ""
+    note = "–: the axis rested." if any(None in row for row in rows) else ""
     return Table("RMSE by trial", " | ".join(("Trial | Held out", *heads)), rows, note)
 
 

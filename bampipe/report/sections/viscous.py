@@ -9,7 +9,6 @@ from bampipe.lists import join_names
 from bampipe.report import style
 from bampipe.report.document import Block, Figure, Paragraph, Table
 from bampipe.report.run_results import Results
-from bampipe.report.wording import format_digits, format_p_value, format_with_sd
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.viscous import Damping, ViscousResult
 
@@ -49,21 +48,14 @@ def _compare(directions: Mapping[str, Damping]) -> str:
 
 
 def _tabulate(directions: Mapping[str, Damping]) -> Table:
-    rows = [
-        (
-            name,
-            format_digits(one.commanded),
-            format_with_sd(one.estimate, one.sd),
-            format_p_value(one.p_value),
-            format_digits(one.own_friction),
-            format_digits(one.felt),
-        )
-        for name, one in directions.items()
-    ]
     return Table(
         "Damping at the handle (N·s/m), along the components of its force",
-        "Direction | >Commanded | >Rendered by the brakes | >p | >Own friction | >Felt by a hand",
-        rows,
+        "Direction | >Commanded | >Rendered by the brakes | >p :p | >Own friction"
+        " | >Felt by a hand",
+        [
+            (name, d.commanded, (d.estimate, d.sd), d.p_value, d.own_friction, d.felt)
+            for name, d in directions.items()
+        ],
         "± one standard deviation over blocks of time. p: probability of so large a difference "
         "from the command if there were none (two-sided, Student's t). Friction and inertia as "
         "identified; the filter does not use the commands of the brakes.",
@@ -88,8 +80,7 @@ def _draw(results: Results, directions: Mapping[str, Damping], trace: pd.DataFra
             extent.append(np.array([command]))
         style.mark_trials(panel, trace)
         style.set_limits(panel, extent)
-        panel.set_title(name)
-        panel.set_xlabel("time in the filter (s)")
+        panel.set(title=name, xlabel="time in the filter (s)")
     panels[0].set_ylabel(style.label_axis("damping", "N.s/m"))
     caption = (
         f"Damping of the viscous field by the filter{results.cite_paper('Fig. 8')}, with 95 % "
