@@ -144,11 +144,7 @@ def _print_slopes(model: Model, e: Equations, pivots: Sequence[str]) -> str:
     numbers: Mapping[Any, Any] = {
         constant_symbol(name): sp.Float(c.value) for name, c in model.device.constants.items()
     }
-    # Sympy cannot tell that a logarithm is real, and gives |x| the slope of a complex number.
-    residual = [
-        (a + o - f).replace(sp.Abs, lambda x: sp.Max(x, -x))
-        for a, o, f in zip(e.applied, e.quiet_other, e.dynamics, strict=True)
-    ]
+    residual = [a + o - f for a, o, f in zip(e.applied, e.quiet_other, e.dynamics, strict=True)]
     slopes = [sp.diff(r, constant_symbol(n)).subs(numbers) for r in residual for n in pivots]
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
     return function_source("slopes", groups, slopes, e.steps)
