@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, get_args
 
 from bampipe.errors import InputError
@@ -58,30 +58,26 @@ class ActingInputs:
     """The inputs that act, as expressions of the logged ones, and the internal states between.
 
     Attributes:
+        logged, side: generalised force and side load, by axis, of the logged inputs.
         acting: by the symbol of a logged force or channel, its acting part, if that differs.
         rates, initial: of the internal states of the effects between, by symbol.
     """
 
-    def __init__(
-        self, d: Vocabulary, effects: Iterable[BoundEffect], applied: list[Any], side: list[Any]
-    ) -> None:
-        """Chain the effects of kind ``input`` among ``effects``.
-
-        Args:
-            effects: its effects, or some of them.
-            applied, side: generalised force and side load, by axis, of the logged inputs.
-        """
-        self._d = d
+    def __init__(self, d: Vocabulary, effects: Iterable[BoundEffect]) -> None:
+        """Chain the effects of kind ``input`` among ``effects``: those of the model, or some."""
+        self._d, device = d, d.model.device
+        self.logged = d.table(device.applied, "applied")
+        self.side = d.table(device.side_load, "side_load")
         self.acting: dict[Any, Any] = {}
         self.rates: dict[Any, Any] = {}
         self.initial: dict[Any, Any] = {}
         for item in order_of_action(e for e in effects if e.effect.kind == "input"):
-            self._add(item, applied, side)
+            self._add(item)
 
-    def _add(self, item: BoundEffect, applied: list[Any], side: list[Any]) -> None:
+    def _add(self, item: BoundEffect) -> None:
         d, device = self._d, self._d.model.device
         known, found = (*device.forces, *device.channels), {}
-        symbols = d.effect_symbols(item, applied, side)
+        symbols = d.effect_symbols(item, self.logged, self.side)
         for key, tree in item.effect.expressions.items():
             place = key.partition(".")[2]
             if not place:
@@ -98,6 +94,20 @@ class ActingInputs:
             rate, initial = d.build_state(item, state, symbols)
             self.rates[z], self.initial[z] = self.put_in(rate), self.put_in_initial(initial)
         self.acting |= found
+
+    @property
+    def input_map(self) -> list[list[Any]]:
+        """d logged / d force, by axis."""
+        measured = [self._d.channel[f] for f in self._d.model.device.forces]
+        return [[e.diff(f) for f in measured] for e in self.logged]
+
+    def add_noise(self, w: Sequence[Any]) -> list[Any]:
+        """Return the generalised force of the acting inputs, noise ``w`` on each measured force."""
+        measured = [self._d.channel[f] for f in self._d.model.device.forces]
+        noisy = {f: self.acting.get(f, f) + n for f, n in zip(measured, w, strict=False)}
+        values = [*(self.acting | noisy).items()]
+        present = [{s: v for s, v in values if s in e.free_symbols} for e in self.logged]
+        return [e.subs(v, simultaneous=True) for e, v in zip(self.logged, present, strict=True)]
 
     def put_in(self, expr: Any) -> Any:
         """Return ``expr`` with the acting parts of logged inputs and derivatives in their place.
