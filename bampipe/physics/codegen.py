@@ -129,17 +129,9 @@ def _print_intermediate(value: Any) -> tuple[str, frozenset[Any]]:
     return _Printer().doprint(value), frozenset(value.free_symbols)
 
 
-@dataclass(frozen=True)
-class Bodies:
-    """A compiled function of a robot's bodies, the same text for all models of the robot.
-
-    Attributes:
-        names: intermediates that it gives, in order; none where the device is no robot.
-        source: of the module.
-    """
-
-    names: tuple[Any, ...]
-    source: str
+Bodies = tuple[tuple[Any, ...], str]
+"""A compiled function of a robot's bodies, the same text for all models of the robot: the
+intermediates that it gives, in order, none where the device is no robot; and its module."""
 
 
 def bodies_at_state(e: Equations) -> Bodies:
@@ -147,16 +139,14 @@ def bodies_at_state(e: Equations) -> Bodies:
     names, block = _print_bodies(e, [*_upper_entries(e), *e.bias])
     lines = [*unpack_groups({"x": [*e.q, *e.qd], "p": e.p}, block.used), *block.lines]
     lines += [f"return ({', '.join(block.values)},)"]
-    returned = f"types.UniTuple(types.float64, {len(names)})"
-    head = f"\n\n@njit({returned}(V, V), cache=True, error_model='numpy')"
-    body = "\n    ".join(lines)
-    return Bodies(names, f"{SCALAR_HEADER}{head}\ndef bodies(x, p):\n    {body}\n")
+    returned = f"types.UniTuple(types.float64, {len(names)})(V, V)"
+    return names, SCALAR_HEADER + _compile(returned, "", "bodies", "x, p", lines)
 
 
 def bodies_along_motion(e: Equations) -> Bodies:
     """``bodies(q, qd, qdd, p, out)``: the forces that a robot's bodies require, (T, names)."""
     names, block = _print_bodies(e, e.dynamics)
-    return Bodies(names, _print_along_motion("bodies", _select_groups(e, "q qd qdd"), e.p, block))
+    return names, _print_along_motion("bodies", _select_groups(e, "q qd qdd"), e.p, block)
 
 
 def _print_along_motion(
@@ -292,6 +282,7 @@ def dynamics_source(e: Equations) -> str:
         "required": ("q qd qdd z u p", [f - o for f, o in forces]),
         "mass_matrix": ("q p", [m for row in e.mass for m in row]),
         "energy": ("q qd p", [e.kinetic, e.potential]),
+        "readings": ("q qd u p", _encoder_readings(e)),
     }
     return _print_over_columns(e, results, e.steps)
 
@@ -301,8 +292,12 @@ def compiled_function(
 ) -> str:
     """A compiled function; its arguments are vectors unless ``kinds`` says otherwise."""
     kinds = kinds or ", ".join(["V"] * len(arguments.split(",")))
-    head = f"\n\n@njit(types.void({kinds}), cache=True, error_model='numpy', {options})"
-    return f"{head}\ndef {name}({arguments}):\n    " + "\n    ".join(body or ["pass"]) + "\n"
+    return _compile(f"types.void({kinds})", options, name, arguments, body or ["pass"])
+
+
+def _compile(signature: str, options: str, name: str, arguments: str, body: Sequence[str]) -> str:
+    head = f"\n\n@njit({signature}, cache=True, error_model='numpy', {options})"
+    return f"{head}\ndef {name}({arguments}):\n    " + "\n    ".join(body) + "\n"
 
 
 def _indent_loop(head: str, body: Sequence[str]) -> list[str]:
@@ -419,16 +414,16 @@ def rows_sources(e: Equations, rows: int) -> dict[str, str]:
     return sources
 
 
-def scalar_sources(e: Equations, bodies: Bodies, title: str = "") -> dict[str, str]:
+def scalar_sources(e: Equations, known: Sequence[Any], title: str) -> dict[str, str]:
     """Sources of the compiled functions of one state, by name.
 
     The measurement has the same text for many models, which is compiled once.
 
     Args:
-        e: the equations; bodies: `bodies_at_state`; title: of its module.
+        e: the equations; known: intermediates that the module ``title`` of `bodies_at_state` gives.
     """
     header = SCALAR_HEADER + (f"from {title} import bodies\n" if title else "")
-    motion = _print_motion(e, known=bodies.names)
+    motion = _print_motion(e, known=known)
     return {
         "derivative": header + compiled_function("derivative", "x, u, p, w, dx", motion),
         "measure": SCALAR_HEADER + filling_function("measure", *_encoder_groups(e)),

@@ -21,7 +21,6 @@ from bampipe.physics.lagrange import allow, check_inertia, lagrange
 from bampipe.physics.model import Model
 from bampipe.physics.newton_euler import (
     INERTIAL,
-    Algebra,
     Link,
     Text,
     Vector,
@@ -337,18 +336,17 @@ def _apply_newton_euler(
     """Newton and Euler's equations of a robot's bodies, once a process for all its models."""
     q, qd, qdd = motion
     text = Text()
-    algebra = Algebra.symbols(text)
     inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
     zeros = [0] * len(q)
     # Everything has a name: one compiled function serves every model of this robot.
-    mass = [[text.name(m) for m in row] for row in mass_matrix(algebra, links, inertial, q)]
+    mass = [[text.name(m) for m in row] for row in mass_matrix(text, links, inertial, q)]
     bias, dynamics = (
-        [text.name(f) for f in joint_forces(algebra, links, inertial, q, qd, a, gravity)]
+        [text.name(f) for f in joint_forces(text, links, inertial, q, qd, a, gravity)]
         for a in (zeros, qdd)
     )
     momentum = [sum(m * v for m, v in zip(row, qd, strict=True)) for row in mass]
     kinetic = sum(p * v for p, v in zip(momentum, qd, strict=True)) / 2
-    potential = potential_energy(algebra, links, inertial, q, gravity)
+    potential = potential_energy(text, links, inertial, q, gravity)
     return _Motion(text.steps, mass, bias, dynamics, kinetic, potential)
 
 

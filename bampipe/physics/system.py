@@ -207,19 +207,8 @@ class System:
         n = len(self.coordinates)
         if not self.moves_sensors:
             return x[:, : 2 * n].copy()
-        from bampipe.model_functions import ROWS
-
-        results = np.empty((len(x), 2 * n))
-        parameters = np.repeat(p, ROWS)
-        for first in range(0, len(x), ROWS):
-            part = slice(first, min(first + ROWS, len(x)))
-            count = part.stop - first
-            states, inputs = (np.zeros((columns.shape[1], ROWS)) for columns in (x, u))
-            states[:, :count], inputs[:, :count] = x[part].T, u[part].T
-            y = np.zeros(2 * n * ROWS)
-            self.measure_rows(count, states.ravel(), inputs.ravel(), parameters, y)
-            results[part] = y.reshape(-1, ROWS)[:, :count].T
-        return results
+        q, qd = x[:, :n].T, x[:, n : 2 * n].T
+        return stack_columns(self._dynamics.readings(q, qd, u.T, p), len(x))
 
     def offset(self, q: Array, u: Array, p: Array) -> Array:
         """Return true minus measured position, (T, n_q), rad or m.
