@@ -227,8 +227,7 @@ def print_portable(e: Equations, parameters: Mapping[Any, float]) -> Block:
         e: the equations of a model without internal states; parameters: value of each symbol.
     """
     numbers = {symbol: sp.Float(value) for symbol, value in parameters.items()}
-    forces = zip(e.dynamics, e.quiet_other, strict=True)
-    required = [sp.sympify(f - o, strict=True).xreplace(numbers) for f, o in forces]
+    required = [sp.sympify(force, strict=True).xreplace(numbers) for force in e.required]
     steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
     return print_block(required, steps, kind=_PortablePrinter)
 
@@ -277,9 +276,8 @@ def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
 
 def dynamics_source(e: Equations) -> str:
     """Source of the functions over columns of the whole mechanism: long where it is a robot."""
-    forces = zip(e.dynamics, e.quiet_other, strict=True)
     results = {
-        "required": ("q qd qdd z u p", [f - o for f, o in forces]),
+        "required": ("q qd qdd z u p", e.required),
         "mass_matrix": ("q p", [m for row in e.mass for m in row]),
         "energy": ("q qd p", [e.kinetic, e.potential]),
         "readings": ("q qd u p", _encoder_readings(e)),
@@ -359,7 +357,8 @@ def _print_motion(e: Equations, index: str = "{}", known: Sequence[Any] = ()) ->
     """
     n = len(e.q)
     upper = [(i, j) for i in range(n) for j in range(i, n)]
-    force = [a + o - h for a, o, h in zip(e.applied_noise, e.other, e.bias, strict=True)]
+    terms = zip(e.applied, e.other, e.noise_force, e.bias, strict=True)
+    force = [a + o + noise - h for a, o, noise, h in terms]
     results = [*_upper_entries(e), *force, *e.rates]
     block = print_block([*results, *e.qd], e.steps, known)
     values = block.values[: len(results)]
@@ -436,8 +435,6 @@ def residual_source(e: Equations, bodies: Sequence[Any]) -> str:
     Args:
         e: the equations; bodies: names of what ``b`` holds, by `bodies_along_motion`.
     """
-    forces = zip(e.applied, e.quiet_other, e.dynamics, strict=True)
-    residual = [a + o - f for a, o, f in forces]
-    block = print_block(residual, e.steps, bodies)
+    block = print_block(e.residual, e.steps, bodies)
     groups = {**_select_groups(e, "q qd qdd"), "b": bodies, **_select_groups(e, "z u")}
     return _print_along_motion("residual", groups, e.p, block)

@@ -67,29 +67,33 @@ def _assemble_equations(d: Vocabulary) -> Equations:
     device, acting = d.model.device, ActingInputs(d, d.model.effects)
     noise = [*device.forces, *device.process_noise]
     w = [sp.Symbol(f"w{i}", real=True) for i in range(len(noise))]
-    applied, noisy = [acting.put_in(e) for e in acting.logged], acting.add_noise(w)
-    terms = _collect_terms(d, acting, w)
+    noise_force = acting.find_noise(w)
+    for name, symbol in zip(device.process_noise, w[len(device.forces) :], strict=True):
+        gains = d.table(device.process_noise[name].torque, f"process_noise.{name}")
+        noise_force = [e + g * symbol for e, g in zip(noise_force, gains, strict=True)]
+    terms = _collect_terms(d, acting)
     inertia = _take_inertia(d, terms.other)
-    _check_dependence(d, applied, acting.input_map, terms, w)
+    _check_dependence(d, acting, terms, noise_force, w)
     motion = _combine_motion(d, terms.energies, inertia)
     offset_rate = [d.ddt(e) if e != 0 else e for e in terms.offset]
     rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
-    parts = [*noisy, *terms.other, *rates, *initial, *terms.offset, *offset_rate]
+    force = _add(acting.applied, terms.other)
+    parts = [*force, *noise_force, *rates, *initial, *terms.offset, *offset_rate]
     used_symbols = _collect_symbols([*parts, *acting.logged])
     inputs = [c for c in d.channels if d.channel[c] in used_symbols or c in device.forces]
-    residual = [a + o - f for a, o, f in zip(applied, terms.other, motion.dynamics, strict=True)]
+    residual = [f - r for f, r in zip(force, motion.dynamics, strict=True)]
     return Equations(
         q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=[".".join(key) for key in d.z],
         u=[d.channel[c] for c in inputs], inputs=inputs,
         p=list(d.p.values()), w=w, noise=noise,
         steps=motion.steps, mass=motion.mass, bias=motion.bias, dynamics=motion.dynamics,
-        other=terms.other, applied=applied, applied_noise=noisy,
+        other=terms.other, applied=acting.applied, noise_force=noise_force,
         input_map=acting.input_map, rates=rates, initial=initial,
         offset=terms.offset, offset_rate=offset_rate,
         kinetic=motion.kinetic, potential=motion.potential,
-        dependence=_find_dependence(d, residual, [*rates, *terms.offset], motion.steps, w),
+        dependence=_find_dependence(d, residual, [*rates, *terms.offset], motion.steps),
         compensation=find_compensation(d, motion.potential, acting),
-        delays=find_delays(d, applied),
+        delays=find_delays(d, acting.applied),
     )  # fmt: skip
 
 
@@ -122,7 +126,7 @@ class _Terms:
     states: dict[Any, tuple[Any, Any]]
 
 
-def _collect_terms(d: Vocabulary, inputs: ActingInputs, w: Sequence[Any]) -> _Terms:
+def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
     """Build the expressions of the device and of each effect, in the order in which they act."""
     device = d.model.device
     acting = [e for e in order_of_action(d.model.effects) if e.effect.kind != "input"]
@@ -130,7 +134,7 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs, w: Sequence[Any]) -> _Te
     potential = d.build(device.potential, d.base, "energy.potential")
     label = f"device {device.name!r}: energy.kinetic"
     energies = [_Energy(label, device.kinetic, kinetic, potential)] if device.energy else []
-    other, offset = _build_device_torque(d, w), [sp.S.Zero for _ in d.axes]
+    other, offset = _build_device_torque(d), [sp.S.Zero for _ in d.axes]
     measures = any(e.effect.kind == "measurement" for e in acting)
     prompt_force = _find_prompt_forces(d) if measures else []
     # All is in terms of the logged inputs until they are replaced by their acting parts.
@@ -201,11 +205,11 @@ def _find_prompt_forces(d: Vocabulary) -> list[Any]:
     inputs = ActingInputs(d, (e for e in d.model.effects if not e.effect.states))
     lost = [d.channel[derivative(f, LAST_ORDER)] for f in d.model.device.forces]
     zeros = dict.fromkeys([*d.qd, *lost], 0)
-    return [inputs.put_in(e).subs(zeros) for e in inputs.logged]
+    return [e.subs(zeros) for e in inputs.applied]
 
 
-def _build_device_torque(d: Vocabulary, w: Sequence[Any]) -> list[Any]:
-    """Q_other of the device without effects: its own torques, friction, brakes, noise."""
+def _build_device_torque(d: Vocabulary) -> list[Any]:
+    """Q_other of the device without effects: its own torques, friction, brakes."""
     device = d.model.device
     other = d.table(device.torque, "torque")
     for i, c in enumerate(device.coordinates):
@@ -214,9 +218,6 @@ def _build_device_torque(d: Vocabulary, w: Sequence[Any]) -> list[Any]:
             other[i] -= d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
         if c.name in device.brakes:
             other[i] -= d.channel[device.brakes[c.name]] * sign
-    for k, name in enumerate(device.process_noise):
-        gains = d.table(device.process_noise[name].torque, f"process_noise.{name}")
-        other = [e + g * w[len(device.forces) + k] for e, g in zip(other, gains, strict=True)]
     return other
 
 
@@ -227,11 +228,7 @@ def _find_dry_friction(d: Vocabulary, other: Sequence[Any]) -> list[Any]:
 
 
 def _check_dependence(
-    d: Vocabulary,
-    applied: list[Any],
-    input_map: list[list[Any]],
-    terms: _Terms,
-    w: Sequence[Any],
+    d: Vocabulary, inputs: ActingInputs, terms: _Terms, noise_force: list[Any], w: list[Any]
 ) -> None:
     """Refuse expressions with names that their place in the equations does not allow."""
     device = d.model.device
@@ -242,13 +239,14 @@ def _check_dependence(
     words = "motion, inputs, parameters and internal states"
     rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
     kinetic, potential = ([getattr(e, k) for e in terms.energies] for k in ("kinetic", "potential"))
-    gains = [gain for row in input_map for gain in row]
+    gains = [gain for row in inputs.input_map for gain in row]
     by_gain = "positions, parameters and channels that are no forces"
     allow("the kinetic energy", kinetic, [*motion, *free], "positions, rates and parameters")
     allow("the potential energy", potential, [*d.q, *free], "positions and parameters")
     allow("the effect of a force on the axes", gains, [*d.q, *others, *free], by_gain)
-    allow("a torque", terms.other, [*all_symbols, *w], words)
-    allow("the applied force", applied, all_symbols, words)
+    allow("a torque", terms.other, all_symbols, words)
+    allow("a process noise", noise_force, [*all_symbols, *w], words)
+    allow("the applied force", inputs.applied, all_symbols, words)
     allow("the rate of an internal state", rates, all_symbols, words)
     allow("an initial value", initial, [*d.q, *u, *free], "positions, inputs and parameters")
     symbols_allowed = [*d.q, *prompt_force, *others, d.channel["t"], *free]
@@ -361,20 +359,17 @@ def _find_dependence(
     residual: Sequence[Any],
     beside: Sequence[Any],
     steps: Sequence[tuple[Any, Any]],
-    w: Sequence[Any],
 ) -> Dependence:
     """Find how the residual depends on each parameter.
 
     Args:
         residual: one expression an axis; beside: other expressions of the model, in which a
-            parameter makes it nonlinear; steps: named intermediates in the residual; w: the noise,
-            which slopes leave out.
+            parameter makes it nonlinear; steps: named intermediates in the residual.
     """
     step_names, numbers = {name for name, _ in steps}, _collect_symbols(v for _, v in steps)
     found = Dependence([], [], [], [], [], [])
     p, varying = [*d.p.values()], {*d.p.values(), *d.z.values()}
-    inputs, no_noise = {*d.channel.values()}, dict.fromkeys(w, 0)
-    elsewhere = _collect_symbols(beside)
+    inputs, elsewhere = {*d.channel.values()}, _collect_symbols(beside)
     # A term has few of the model's parameters, and sympy is slow to find a slope zero.
     terms = [[(t, t.free_symbols) for t in sp.Add.make_args(e)] for e in residual]
     for i, symbol in enumerate(p):
@@ -394,8 +389,6 @@ def _find_dependence(
         found.linear.append(linear)
         found.constant.append(constant)
         found.unforced.append(constant and slope_symbols.isdisjoint(inputs))
-        if lasts and not slope_symbols.isdisjoint(w):
-            by_axis = {k: slope.subs(no_noise) for k, slope in by_axis.items()}
         found.lasting.append(by_axis if lasts else None)
         found.products.extend((j, i) for j in range(i) if p[j] in curving)
         if bodily and not by_axis:

@@ -138,7 +138,7 @@ def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
                 if j >= i and e.mass[i][j] != 0:
                     lines.append((f"M[{a},{b}] = ", text(e.mass[i][j])))
         lines += [(f"h[{a}] = ", text(h)) for a, h in zip(marks, e.bias, strict=True)]
-    for a, applied, other in zip(marks, e.applied, e.quiet_other, strict=True):
+    for a, applied, other in zip(marks, e.applied, e.other, strict=True):
         lines.append((f"Q[{a}] = ", text(applied + other)))
     lines += [(f"d {z}/dt = ", text(rate)) for z, rate in zip(e.z_names, e.rates, strict=True)]
     return {"potential": text(e.potential), "lines": lines}

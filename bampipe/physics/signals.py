@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, get_args
 
 from bampipe.errors import InputError
@@ -95,19 +96,27 @@ class ActingInputs:
             self.rates[z], self.initial[z] = self.put_in(rate), self.put_in_initial(initial)
         self.acting |= found
 
-    @property
+    @cached_property
+    def applied(self) -> list[Any]:
+        """Generalised force of the acting inputs, by axis."""
+        return [self.put_in(e) for e in self.logged]
+
+    @cached_property
     def input_map(self) -> list[list[Any]]:
         """d logged / d force, by axis."""
-        measured = [self._d.channel[f] for f in self._d.model.device.forces]
-        return [[e.diff(f) for f in measured] for e in self.logged]
+        return [[e.diff(f) for f in self._measured] for e in self.logged]
 
-    def add_noise(self, w: Sequence[Any]) -> list[Any]:
-        """Return the generalised force of the acting inputs, noise ``w`` on each measured force."""
-        measured = [self._d.channel[f] for f in self._d.model.device.forces]
-        noisy = {f: self.acting.get(f, f) + n for f, n in zip(measured, w, strict=False)}
+    @property
+    def _measured(self) -> list[Any]:
+        return [self._d.channel[f] for f in self._d.model.device.forces]
+
+    def find_noise(self, w: Sequence[Any]) -> list[Any]:
+        """Return the generalised force of noise ``w`` on each measured force, by axis."""
+        noisy = {f: self.acting.get(f, f) + n for f, n in zip(self._measured, w, strict=False)}
         values = [*(self.acting | noisy).items()]
         present = [{s: v for s, v in values if s in e.free_symbols} for e in self.logged]
-        return [e.subs(v, simultaneous=True) for e, v in zip(self.logged, present, strict=True)]
+        triples = zip(self.logged, present, self.applied, strict=True)
+        return [e.subs(v, simultaneous=True) - a for e, v, a in triples]
 
     def put_in(self, expr: Any) -> Any:
         """Return ``expr`` with the acting parts of logged inputs and derivatives in their place.

@@ -34,7 +34,7 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
     # Without motion there is no force. For a robot's bodies, see `base_parameters`.
     for expr in (e.kinetic, e.potential) if model.device.robot is None else ():
         factors += _collect_factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
-    for expr in (*e.applied, *e.quiet_other, *e.rates, *e.offset):
+    for expr in (*e.applied, *e.other, *e.rates, *e.offset):
         factors += _collect_factors(expr, motion, set(names))
     known_symbols: set[Any] = set()
     while True:
@@ -144,7 +144,6 @@ def _print_slopes(model: Model, e: Equations, pivots: Sequence[str]) -> str:
     numbers: Mapping[Any, Any] = {
         constant_symbol(name): sp.Float(c.value) for name, c in model.device.constants.items()
     }
-    residual = [a + o - f for a, o, f in zip(e.applied, e.quiet_other, e.dynamics, strict=True)]
-    slopes = [sp.diff(r, constant_symbol(n)).subs(numbers) for r in residual for n in pivots]
+    slopes = [sp.diff(r, constant_symbol(n)).subs(numbers) for r in e.residual for n in pivots]
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
     return function_source("slopes", groups, slopes, e.steps)
