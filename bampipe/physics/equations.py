@@ -1,5 +1,6 @@
 """The symbolic equations of motion of a model, and the terms of its effects."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,3 +102,12 @@ def contribution(full: Equations, bare: Equations) -> list[Any]:
         force = full.applied[i] - bare.applied[i] + full.other[i] - bare.other[i]
         added.append(sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia, strict=True))
     return added
+
+
+def join_overlapping(sets: Iterable[set[Any]]) -> list[set[Any]]:
+    """Join sets that share an element."""
+    joined: list[set[Any]] = []
+    for one in sets:
+        touching = [s for s in joined if s & one]
+        joined = [s for s in joined if not s & one] + [one.union(*touching)]
+    return joined

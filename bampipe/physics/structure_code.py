@@ -8,7 +8,7 @@ import sympy as sp
 
 from bampipe.physics.codegen import ARRAY_HEADER, function_source
 from bampipe.physics.derivation import derive
-from bampipe.physics.equations import Equations
+from bampipe.physics.equations import Equations, join_overlapping
 from bampipe.physics.model import Model
 from bampipe.physics.readable import notation
 from bampipe.physics.vocabulary import constant_symbol
@@ -52,7 +52,7 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
     ]
     pivots: list[str] = [name for name, *_ in numbers]
     groups = []
-    for members in _join_overlapping([f.free_symbols for f in open_factors]):
+    for members in join_overlapping([f.free_symbols for f in open_factors]):
         own = [f for f in open_factors if f.free_symbols <= members]
         ordered = [name for symbol, name in names.items() if symbol in members]
         groups.append([ordered, [notation(f, names) for f in own]])
@@ -128,15 +128,6 @@ def _select_distinct(factors: Sequence[Any]) -> list[Any]:
         if all(not sp.cancel(factor / other).is_number for other in terms_kept):
             terms_kept.append(-factor if str(factor).startswith("-") else factor)
     return terms_kept
-
-
-def _join_overlapping(sets: Sequence[set[Any]]) -> list[set[Any]]:
-    """Join sets that share an element."""
-    joined: list[set[Any]] = []
-    for one in map(set, sets):
-        touching = [s for s in joined if s & one]
-        joined = [s for s in joined if not s & one] + [one.union(*touching)]
-    return joined
 
 
 def _print_slopes(model: Model, e: Equations, pivots: Sequence[str]) -> str:
