@@ -279,7 +279,6 @@ def dynamics_source(e: Equations) -> str:
     results = {
         "required": ("q qd qdd z u p", e.required),
         "mass_matrix": ("q p", [m for row in e.mass for m in row]),
-        "energy": ("q qd p", [e.kinetic, e.potential]),
         "readings": ("q qd u p", _encoder_readings(e)),
     }
     return _print_over_columns(e, results, e.steps)

@@ -26,7 +26,6 @@ from bampipe.physics.newton_euler import (
     Vector,
     joint_forces,
     mass_matrix,
-    potential_energy,
 )
 from bampipe.physics.robot import gravity_vector
 from bampipe.physics.roles import find_compensation, find_delays
@@ -82,6 +81,7 @@ def _assemble_equations(d: Vocabulary) -> Equations:
     used_symbols = _collect_symbols([*parts, *acting.logged])
     inputs = [c for c in d.channels if d.channel[c] in used_symbols or c in device.forces]
     residual = [f - r for f, r in zip(force, motion.dynamics, strict=True)]
+    kinetic, potential = (sp.Add(*(e[k] for e in terms.energies)) for k in (2, 3))
     return Equations(
         q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=[".".join(key) for key in d.z],
         u=[d.channel[c] for c in inputs], inputs=inputs,
@@ -90,9 +90,9 @@ def _assemble_equations(d: Vocabulary) -> Equations:
         other=terms.other, applied=acting.applied, noise_force=noise_force,
         input_map=acting.input_map, rates=rates, initial=initial,
         offset=terms.offset, offset_rate=offset_rate,
-        kinetic=motion.kinetic, potential=motion.potential,
+        kinetic=kinetic, potential=potential,
         dependence=_find_dependence(d, residual, [*rates, *terms.offset], motion.steps),
-        compensation=find_compensation(d, motion.potential, acting),
+        compensation=find_compensation(d, potential, acting),
         delays=find_delays(d, acting.applied),
     )  # fmt: skip
 
@@ -260,8 +260,6 @@ class _Motion(NamedTuple):
     mass: list[list[Any]]
     bias: list[Any]
     dynamics: list[Any]
-    kinetic: Any
-    potential: Any
 
 
 def _combine_motion(d: Vocabulary, energies: Sequence[_Energy], taken: Sequence[Any]) -> _Motion:
@@ -276,7 +274,6 @@ def _combine_motion(d: Vocabulary, energies: Sequence[_Energy], taken: Sequence[
         motion = _Motion(
             bodies.steps, [_add(*rows) for rows in zip(motion.mass, bodies.mass, strict=True)],
             _add(motion.bias, bodies.bias), _add(motion.dynamics, bodies.dynamics),
-            motion.kinetic + bodies.kinetic, motion.potential + bodies.potential,
         )  # fmt: skip
     mass = [
         [m - (taken[i] if i == j else 0) for j, m in enumerate(row)]
@@ -319,9 +316,7 @@ def _apply_lagrange(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
         h + sum(m * x for m, x in zip(row, d.qdd, strict=True))
         for h, row in zip(bias, mass, strict=True)
     ]
-    kinetic = sum((e.kinetic for e in energies), sp.S.Zero)
-    potential = sum((e.potential for e in energies), sp.S.Zero)
-    return _Motion([], mass, bias, dynamics, kinetic, potential)
+    return _Motion([], mass, bias, dynamics)
 
 
 @cache
@@ -342,10 +337,7 @@ def _apply_newton_euler(
         [text.name(f) for f in joint_forces(text, links, inertial, q, qd, a, gravity)]
         for a in (zeros, qdd)
     )
-    momentum = [sum(m * v for m, v in zip(row, qd, strict=True)) for row in mass]
-    kinetic = sum(p * v for p, v in zip(momentum, qd, strict=True)) / 2
-    potential = potential_energy(text, links, inertial, q, gravity)
-    return _Motion(text.steps, mass, bias, dynamics, kinetic, potential)
+    return _Motion(text.steps, mass, bias, dynamics)
 
 
 @lru_cache(maxsize=4096)

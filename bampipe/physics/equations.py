@@ -46,7 +46,8 @@ class Equations:
         input_map: d applied / d force of the device itself.
         rates, initial: of the internal states.
         offset, offset_rate: q_true - q_measured and its time derivative.
-        kinetic, potential: energies, as declared, definitions put in.
+        kinetic, potential: declared energies, definitions put in; without those of a robot's
+            bodies.
         dependence: of the residual on each parameter.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
             `roles.find_compensation`; zero without one.

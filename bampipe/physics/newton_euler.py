@@ -219,28 +219,6 @@ def _unit_wrenches(at: _LinkMotion) -> list[tuple[Vector, Vector]]:
     return results + [(ZERO, moment) for moment in moments]
 
 
-def potential_energy(
-    algebra: Algebra,
-    links: Sequence[Link],
-    inertial: Sequence[Sequence[Any]],
-    q: Sequence[Any],
-    gravity: Vector,
-) -> Any:
-    """Return the potential energy of gravity, J; zero where all moments are at the base."""
-    still = [0] * len(q)
-    moving = _link_motions(algebra, links, q, still, still, gravity)
-    heights: list[Any] = []
-    total: Any = 0
-    for link, at, (mass, *rest) in zip(links, moving, inertial, strict=True):
-        below: Vector = (
-            moving[link.parent].acceleration if link.parent >= 0 else _scale(-1, gravity)
-        )
-        height = heights[link.parent] if link.parent >= 0 else 0
-        heights.append(algebra.name(height + _dot(below, at.offset)))
-        total = total + mass * heights[-1] + _dot(at.acceleration, (rest[0], rest[1], rest[2]))
-    return algebra.name(total)
-
-
 def mass_matrix(
     algebra: Algebra, links: Sequence[Link], inertial: Sequence[Sequence[Any]], q: Sequence[Any]
 ) -> list[list[Any]]:

@@ -359,11 +359,6 @@ class System:
         n = len(self.coordinates)
         return stack_columns(self._dynamics.mass_matrix(q.T, p), len(q)).reshape(len(q), n, n)
 
-    def energy(self, q: Array, qd: Array, p: Array) -> tuple[Array, Array]:
-        """Kinetic and potential energy, each (T,), J."""
-        both = stack_columns(self._dynamics.energy(q.T, qd.T, p), len(q))
-        return both[:, 0], both[:, 1]
-
     def compensation(self, q: Array, qd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force of the gravity compensator (eq 16), (T, n_q), N.m or N.
 
