@@ -2,9 +2,10 @@
 
 import ast
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import permutations
 from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, StringConstraints, Tag
@@ -260,13 +261,7 @@ class Effect(DeclaredFile):
         if self.kind == "energy" or (isinstance(self.torque, Mapping) and len(self.torque) > 1):
             return _list_neighbours(device)
         names = [c.name for c in device.coordinates]
-        farthest = _FARTHEST if device.robot is None else 1
-        return {
-            f"{a}-{b}": (a, b)
-            for i, a in enumerate(names)
-            for j, b in enumerate(names)
-            if 0 < abs(i - j) <= farthest
-        }
+        return _pair_near(names, names, _FARTHEST if device.robot is None else 1, "-")
 
     @cached_property
     def names(self) -> set[str]:
@@ -290,11 +285,6 @@ class Effect(DeclaredFile):
     def uses_inertia(self) -> bool:
         """Whether it acts on what the energies require of its axis."""
         return self.ahead is not None or bool(self.names & {"axis_inertia", "axis_bias"})
-
-    @property
-    def uses_pull(self) -> bool:
-        """Whether it acts on what pulls by position, springs included."""
-        return "pull" in self.terms
 
     @property
     def pulls(self) -> bool:
@@ -327,12 +317,18 @@ def force_pairs(device: Device) -> dict[str, tuple[str, str]]:
     The drives of a robot may share a gear with their neighbours, not with all others.
     """
     names, forces = device.components, device.forces
-    between, near = ("", len(names)) if device.robot is None else ("-", 1)
+    farthest, between = (len(names), "") if device.robot is None else (1, "-")
+    return _pair_near(names, forces, farthest, between)
+
+
+def _pair_near(
+    names: Sequence[str], values: Sequence[str], farthest: int, between: str
+) -> dict[str, tuple[str, str]]:
+    """Ordered pairs of values at most so far apart, by their names with ``between`` them."""
     return {
-        f"{a}{between}{b}": (forces[i], forces[j])
-        for i, a in enumerate(names)
-        for j, b in enumerate(names)
-        if 0 < abs(i - j) <= near
+        f"{names[i]}{between}{names[j]}": (values[i], values[j])
+        for i, j in permutations(range(len(names)), 2)
+        if abs(i - j) <= farthest
     }
 
 

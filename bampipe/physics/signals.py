@@ -42,7 +42,7 @@ def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
         return item.effect.kind == earlier.effect.kind
     if "dry" in item.effect.names:
         return earlier.effect.kind in ("torque", "input")
-    if item.effect.uses_pull and earlier.effect.pulls:
+    if "pull" in item.effect.terms and earlier.effect.pulls:
         return item.effect.scope == "device" or item.target == earlier.target
     if earlier.effect.acting_link not in ("lag", "saturation"):
         return False
