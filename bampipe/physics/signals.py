@@ -80,9 +80,7 @@ class ActingInputs:
         known, found = (*device.forces, *device.channels), {}
         symbols = d.effect_symbols(item, self.logged, self.side)
         for key, tree in item.effect.expressions.items():
-            place = key.partition(".")[2]
-            if not place:
-                place = item.target if item.effect.scope == "channel" else d.targeted(item)[0]
+            place = key.partition(".")[2] or item.places[0]
             for name in device.forces if place == EACH else (place,):
                 if name not in known:
                     raise InputError(f"effect {item.name!r}: device has no input {name!r}")
