@@ -175,10 +175,7 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
                 pull[axis] += value
             if by_axis is other and effect.acting_link:
                 delivered_force[axis] += value
-        for state in effect.states:
-            rate, initial = d.build_state(item, state, symbols)
-            z = d.z[item.prefix, state.name]
-            states[z] = inputs.put_in(rate), inputs.put_in_initial(initial)
+        states |= {z: (rate, start) for z, rate, start in inputs.build_states(item, symbols)}
     other = [inputs.put_in(e) for e in other]
     return _Terms(energies, other, offset, {z: states[z] for z in d.z.values()})
 

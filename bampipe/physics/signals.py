@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -88,10 +88,8 @@ class ActingInputs:
                     for k in range(len(INPUT_ORDERS)):
                         symbols[derivative("f", k)] = d.channel[derivative(name, k)]
                 found[d.channel[name]] = self.put_in(d.build(tree, symbols, key, item))
-        for state in item.effect.states:
-            z = d.z[item.prefix, state.name]
-            rate, initial = d.build_state(item, state, symbols)
-            self.rates[z], self.initial[z] = self.put_in(rate), self.put_in_initial(initial)
+        for z, rate, initial in self.build_states(item, symbols):
+            self.rates[z], self.initial[z] = rate, initial
         self.acting |= found
 
     @cached_property
@@ -116,6 +114,18 @@ class ActingInputs:
         triples = zip(self.logged, present, self.applied, strict=True)
         return [e.subs(v, simultaneous=True) - a for e, v, a in triples]
 
+    def build_states(
+        self, item: BoundEffect, symbols: Mapping[str, Any]
+    ) -> Iterator[tuple[Any, Any, Any]]:
+        """Yield the internal states of ``item``, each with its rate and its initial value."""
+        for state in item.effect.states:
+            what = f"states.{state.name}"
+            rate = self._d.build(state.rate, symbols, f"{what}.rate", item)
+            initial = self._d.build(state.initial, symbols, f"{what}.initial", item)
+            # At the start, states between log and mechanism have their initial values.
+            initial = self.put_in(initial).subs(self.initial, simultaneous=True)
+            yield self._d.z[item.prefix, state.name], self.put_in(rate), initial
+
     def put_in(self, expr: Any) -> Any:
         """Return ``expr`` with the acting parts of logged inputs and derivatives in their place.
 
@@ -134,7 +144,3 @@ class ActingInputs:
                     raise InputError(f"the time derivative {k} of {force!r} is not known")
                 values[d.channel[derivative(force, k)]] = value
         return expr.subs(values, simultaneous=True) if values else expr
-
-    def put_in_initial(self, expr: Any) -> Any:
-        """Return the same for an initial value, with initial states between log and mechanism."""
-        return self.put_in(expr).subs(self.initial, simultaneous=True)

@@ -9,7 +9,7 @@ import sympy as sp
 from bampipe.errors import InputError
 from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
-from bampipe.physics.effect import PAIR, BoundEffect, State
+from bampipe.physics.effect import PAIR, BoundEffect
 from bampipe.physics.model import Model
 from bampipe.physics.time_limit import OutOfTime
 
@@ -205,11 +205,3 @@ class Vocabulary:
         for p in item.parameters:
             symbols[p.name.removeprefix(f"{item.prefix}.")] = self.p[p.name]
         return symbols
-
-    def build_state(self, item: BoundEffect, state: State, symbols: Symbols) -> tuple[Any, Any]:
-        """Rate and initial value of an internal state of ``item``."""
-        what = f"states.{state.name}"
-        return (
-            self.build(state.rate, symbols, f"{what}.rate", item),
-            self.build(state.initial, symbols, f"{what}.initial", item),
-        )
