@@ -1,13 +1,13 @@
 """Simulation of a machine together with its controller, in closed loop."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import float64, int64, void
 
-from bampipe.arrays import Array, Indices
-from bampipe.compiled import njit, part, record_type
+from bampipe.arrays import Array
+from bampipe.compiled import njit, part
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.simulation import PLANT, Plant, require_finite, stable_steps
 from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
@@ -16,58 +16,42 @@ _V = float64[::1]
 _M = float64[:, ::1]
 
 
-class _Controller(NamedTuple):
-    """The controller besides its law.
-
-    Attributes:
-        columns: of the inputs that it commands; ticks: how often it acts in a sample.
-        states: (n_s,) its integrals; limits: (n_s, 2) of these.
-    """
-
-    columns: Indices
-    ticks: int
-    states: Array
-    limits: Array
-
-
-_CONTROLLER = record_type(_Controller, int64[::1], int64, _V, _M)
-
-
 @part()
-def _act(command, controller, y, r, dt, out):  # type: ignore[no-untyped-def]
+def _act(command, states, limits, y, r, dt, out):  # type: ignore[no-untyped-def]
     """Write commands from readings and references, and advance the controller by ``dt``.
 
-    ``out`` (nf + n_s,) receives the commands, then the rates of its states.
+    ``out`` (nf + n_s,) receives the commands, then the rates of its states, which stay within
+    ``limits`` (n_s, 2).
     """
-    states, limits = controller.states, controller.limits
-    nf = controller.columns.shape[0]
     command(y, r, states, out)
-    for i in range(states.shape[0]):
-        states[i] = min(max(states[i] + dt * out[nf + i], limits[i, 0]), limits[i, 1])
+    for i in range(-states.shape[0], 0):
+        states[i] = min(max(states[i] + dt * out[i], limits[i, 0]), limits[i, 1])
 
 
 @njit(
     void(
-        DERIVATIVE, MEASURE, COMMAND, _M, _M, _M, _M, PLANT, _CONTROLLER, float64
+        DERIVATIVE, MEASURE, COMMAND, _M, _M, _M, _M, PLANT, int64[::1], _V, _M, int64, float64
     ),
     cache=True,
 )  # fmt: skip
 def _close(  # type: ignore[no-untyped-def]
-    derivative, measure, command, x, u, r, readings, plant, controller, dt
+    derivative, measure, command, x, u, r, readings, plant, columns, states, limits, ticks, dt
 ):
-    """Fill the rows of ``x`` after the first, the commands in ``u``, and the readings."""
+    """Fill the rows of ``x`` after the first, the commands in ``u``, and the readings.
+
+    The controller commands ``columns`` of ``u`` and acts ``ticks`` times in a sample.
+    """
     p, w = plant.p, plant.w
-    columns, ticks = controller.columns, controller.ticks
     nu, nr, nf = u.shape[1], r.shape[1], columns.shape[0]
     start, end, given, straight = np.empty(nu), np.empty(nu), np.empty(nr), np.zeros(nu)
-    out, work = np.empty(nf + controller.states.shape[0]), np.zeros((8, max(x.shape[1], nu)))
+    out, work = np.empty(nf + states.shape[0]), np.zeros((8, max(x.shape[1], nu)))
     tick_s = dt / ticks
     for k in range(x.shape[0]):
         if k > 0:
             for j in range(nf):  # the encoders may be moved by the load
                 u[k, columns[j]] = out[j]
         measure(x[k], u[k], p, readings[k])
-        _act(command, controller, readings[k], r[k], tick_s, out)
+        _act(command, states, limits, readings[k], r[k], tick_s, out)
         for j in range(nf):
             u[k, columns[j]] = out[j]
         if k + 1 == x.shape[0]:
@@ -84,7 +68,7 @@ def _close(  # type: ignore[no-untyped-def]
                 for j in range(nr):
                     given[j] = r[k, j] + (r[k + 1, j] - r[k, j]) * tick / ticks
                 measure(x[k + 1], start, p, readings[k + 1])
-                _act(command, controller, readings[k + 1], given, tick_s, out)
+                _act(command, states, limits, readings[k + 1], given, tick_s, out)
             for j in range(nf):
                 start[columns[j]] = out[j]
                 end[columns[j]] = out[j]
@@ -139,12 +123,11 @@ def simulate_controlled(
     bounds = np.array(limits, dtype=np.float64).reshape(-1, 2)
     measure(x[0], total[0], plant.p, readings[0])
     states = _first_states(command, readings[0], references[0], recorded, bounds)
-    controller = _Controller(
-        columns=columns,
-        ticks=max(1, round(dt * rate_hz) if rate_hz > 0.0 else int(np.ceil(dt / 1e-3 - 1e-9))),
-        states=states, limits=bounds,
+    ticks = max(1, round(dt * rate_hz) if rate_hz > 0.0 else int(np.ceil(dt / 1e-3 - 1e-9)))
+    _close(
+        derivative, measure, command, x, total, references, readings, plant, columns, states,
+        bounds, ticks, dt,
     )  # fmt: skip
-    _close(derivative, measure, command, x, total, references, readings, plant, controller, dt)
     require_finite(x, dt)
     return x, total, readings
 

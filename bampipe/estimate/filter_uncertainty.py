@@ -105,17 +105,15 @@ def climb(
         before = value
         for k in range(start.size):
             for sign in (1.0, -1.0):
-                moved_any = False
+                first = value
                 for _ in range(_STEPS):
                     tried = best.copy()
                     tried[k] = max(tried[k] + sign * step[k], lower[k])
-                    if tried[k] == best[k]:
-                        break
                     candidate = likely(*tried)
                     if not candidate > value:
                         break
-                    best, value, moved_any = tried, candidate, True
-                if moved_any:
+                    best, value = tried, candidate
+                if value > first:
                     break
         if value == before:
             break

@@ -254,8 +254,7 @@ def energy_lost(torque: Array, deflection: Array, stiffness: float) -> float:
     """
     x = deflection - 0.5 * (float(np.min(deflection)) + float(np.max(deflection)))
     level = 0.5 * (float(np.min(torque)) + float(np.max(torque)))
-    rest = torque - level - stiffness * x
-    return float(np.sum(0.5 * (rest[1:] + rest[:-1]) * np.diff(x)))
+    return float(np.trapezoid(torque - level - stiffness * x, x))
 
 
 def measure_hysteresis(torque: Array, deflection: Array, rate_hz: float) -> Hysteresis:

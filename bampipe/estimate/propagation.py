@@ -10,7 +10,6 @@ from bampipe.compiled import part, record_type
 from bampipe.model_functions import ROWS
 
 _V = float64[::1]
-_M = float64[:, ::1]
 
 
 class Estimated(NamedTuple):

@@ -8,7 +8,6 @@ standstill to stop within the interval: the rate is probed on the model itself.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,8 +38,7 @@ class Runaway(InputError):
     """A simulated motion grows without bounds."""
 
 
-@dataclass(frozen=True)
-class Arm:
+class Arm(NamedTuple):
     """The arm that pulls the mechanism towards a reference motion.
 
     The arm demands the acceleration ``natural_frequency**2 * (q_ref - q) + 2 * damping_ratio *
@@ -63,9 +61,9 @@ class Arm:
 
     q_ref: Array
     qd_ref: Array
-    force: Sequence[int]
-    rate: Sequence[int] = ()
-    curvature: Sequence[int] = ()
+    force: Sequence[int] | Indices
+    rate: Sequence[int] | Indices = ()
+    curvature: Sequence[int] | Indices = ()
     moved_first: Indices | None = None
     natural_frequency: float = 12.0
     damping_ratio: float = 1.0
@@ -90,35 +88,8 @@ class Plant(NamedTuple):
     max_step: float
 
 
-class _Arm(NamedTuple):
-    """The same as the kernel takes it.
-
-    Attributes:
-        at, moving: (n_q,) places in the state of the positions that it moves, by coordinate, and
-            of their rates.
-    """
-
-    at: Indices
-    moving: Indices
-    force: Indices
-    rate: Indices
-    curvature: Indices
-    q_ref: Array
-    qd_ref: Array
-    natural_frequency: float
-    damping_ratio: float
-    bandwidth: float
-
-
-class _Brakes(NamedTuple):
-    """Columns with the commands, and gain (T, n_q)."""
-
-    columns: Indices
-    gain: Array
-
-
 PLANT = record_type(Plant, _V, _V, _V, float64)
-_ARM = record_type(_Arm, *[_I] * 5, _M, _M, *[float64] * 3)
+_ARM = record_type(Arm, _M, _M, _I, _I, _I, int64[:, ::1], *[float64] * 3)
 
 
 @part()
@@ -173,7 +144,7 @@ def _count_steps(derivative, x, u, plant, dt):  # type: ignore[no-untyped-def]
 @part()
 def _solve_goal(derivative, x, u, plant, arm, k, out):  # type: ignore[no-untyped-def]
     """Write the force that alone would give the acceleration which the arm demands at sample k."""
-    p, w, force = plant.p, plant.w, arm.force
+    p, w, force, at = plant.p, plant.w, arm.force, arm.moved_first
     frequency, damping = arm.natural_frequency, arm.damping_ratio
     nx, n, nf = x.shape[0], plant.width.shape[0], force.shape[0]
     still, moved, response = np.empty(nx), np.empty(nx), np.empty((n, nf))
@@ -184,7 +155,7 @@ def _solve_goal(derivative, x, u, plant, arm, k, out):  # type: ignore[no-untype
         derivative(x, u, p, w, moved)
         u[force[j]] -= 1.0
         for i in range(n):
-            response[i, j] = moved[arm.moving[i]] - still[arm.moving[i]]
+            response[i, j] = moved[at[i, 1]] - still[at[i, 1]]
     trace = 0.0
     for j in range(nf):
         out[j] = 0.0
@@ -195,8 +166,8 @@ def _solve_goal(derivative, x, u, plant, arm, k, out):  # type: ignore[no-untype
             normal[j, other] = total
         trace += normal[j, j]
     for i in range(n):
-        error = frequency * frequency * (arm.q_ref[k, i] - x[arm.at[i]])
-        error += 2.0 * damping * frequency * (arm.qd_ref[k, i] - x[arm.moving[i]])
+        error = frequency * frequency * (arm.q_ref[k, i] - x[at[i, 0]])
+        error += 2.0 * damping * frequency * (arm.qd_ref[k, i] - x[at[i, 1]])
         for j in range(nf):
             out[j] += response[i, j] * error
     for j in range(nf):  # keeps the solution finite where a force moves nothing
@@ -212,14 +183,14 @@ def _solve_goal(derivative, x, u, plant, arm, k, out):  # type: ignore[no-untype
         out[j] /= factor[j, j]
 
 
-@njit(void(DERIVATIVE, _M, _M, PLANT, _ARM, record_type(_Brakes, _I, _M), float64), cache=True)
-def _run(derivative, x, u, plant, arm, brakes, dt):  # type: ignore[no-untyped-def]
+@njit(void(DERIVATIVE, _M, _M, PLANT, _ARM, _I, _M, float64), cache=True)
+def _run(derivative, x, u, plant, arm, brake, brake_gain, dt):  # type: ignore[no-untyped-def]
     """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``.
 
-    Without columns of force there is no arm.
+    Without columns of force there is no arm. ``brake`` holds the columns with the commands, and
+    ``brake_gain`` (T, n_q) the damping.
     """
     force, rate, curvature, bandwidth = arm.force, arm.rate, arm.curvature, arm.bandwidth
-    brake, brake_gain = brakes.columns, brakes.gain
     n, nf = plant.width.shape[0], force.shape[0]
     # Force of the arm, its rate, the target force; speed as the brakes' controller sees it.
     pull, pull_rate, goal, speed = np.zeros(nf), np.zeros(nf), np.zeros(nf), np.zeros(n)
@@ -300,16 +271,14 @@ def simulate(
     x[0] = x0
     total = np.array(u, dtype=np.float64, order="C")
     first = np.arange(2 * n).reshape(2, n).T if arm.moved_first is None else arm.moved_first
-    indices = (*first.T, arm.force, arm.rate, arm.curvature)
-    at, moving, force, rate, curvature = (np.array(some, dtype=np.int64) for some in indices)
+    indices = (arm.force, arm.rate, arm.curvature, first)
     # Copies: columns of a table are read-only.
-    q_ref, qd_ref = (np.array(ref, dtype=np.float64, order="C") for ref in (q_ref, qd_ref))
-    pull = _Arm(
-        at, moving, force, rate, curvature, q_ref, qd_ref,
-        arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
-    )  # fmt: skip
-    brakes = _Brakes(np.array(brake[: gain.shape[1]], dtype=np.int64), np.ascontiguousarray(gain))
-    _run(derivative, x, total, plant, pull, brakes, dt)
+    references = (np.array(ref, dtype=np.float64, order="C") for ref in (q_ref, qd_ref))
+    columns = (np.array(some, dtype=np.int64, order="C") for some in indices)
+    sizes = map(float, (arm.natural_frequency, arm.damping_ratio, arm.bandwidth))
+    pull = Arm._make((*references, *columns, *sizes))
+    brakes = np.array(brake[: gain.shape[1]], dtype=np.int64)
+    _run(derivative, x, total, plant, pull, brakes, np.ascontiguousarray(gain), dt)
     require_finite(x, dt)
     return np.ascontiguousarray(x[::finer]), np.ascontiguousarray(total[::finer])
 

@@ -36,20 +36,6 @@ _V = float64[::1]
 _M = float64[:, ::1]
 
 
-class Samples(NamedTuple):
-    """Consecutive samples.
-
-    Attributes:
-        t: (T,) s; u: (T, nu) inputs; curvature: (T, nu) their second time derivatives.
-        y: (T, ny) readings, NaN where one is missing.
-    """
-
-    t: Array
-    u: Array
-    curvature: Array
-    y: Array
-
-
 class Levels(NamedTuple):
     """Noise and numerical settings, as the kernel takes them.
 
@@ -57,8 +43,8 @@ class Levels(NamedTuple):
         process_sd: (nw,) of the process noise of each sample.
         walk_sd: (nt,) random walk of the parameters, per square root of a second.
         reading_sd: (ny,) of the measurement noise, additive.
-        spread: squared distance of the sigma points, in variances.
-        other: weight of each point but the central one, which has none, in a covariance.
+        spread: squared distance of the sigma points, in variances; the central one has no weight
+            in a covariance, the others have equal ones.
         longest_step: of the Runge-Kutta method, s.
         stride: of the stored distributions, samples.
     """
@@ -67,7 +53,6 @@ class Levels(NamedTuple):
     walk_sd: Array
     reading_sd: Array
     spread: float
-    other: float
     longest_step: float
     stride: int
 
@@ -78,8 +63,8 @@ class Levels(NamedTuple):
         MEASURE_ROWS,
         ESTIMATED,
         _V,
-        record_type(Levels, _V, _V, _V, float64, float64, float64, int64),
-        record_type(Samples, _V, _M, _M, _M),
+        record_type(Levels, _V, _V, _V, float64, float64, int64),
+        *(_V, _M, _M, _M),
         _V,
         _M,
     ),
@@ -87,7 +72,7 @@ class Levels(NamedTuple):
     fastmath={"contract"},
 )
 def filter_square_root(  # type: ignore[no-untyped-def]
-    derivative, measure, estimated, p, levels, samples, mean, factor
+    derivative, measure, estimated, p, levels, t, u, curvature, y, mean, factor
 ):
     """Filter one trial, propagating the lower root of the covariance.
 
@@ -99,8 +84,10 @@ def filter_square_root(  # type: ignore[no-untyped-def]
 
     Args:
         derivative: f(count, x, u, p, w, dx); measure: h(count, x, u, p, y).
-        estimated, levels, samples: the model, its noise and the trial.
+        estimated, levels: the model and its noise.
         p: (np + 1,) all parameters, then the input delay.
+        t: (T,) s; u: (T, nu) inputs; curvature: (T, nu) their second time derivatives.
+        y: (T, ny) readings, NaN where one is missing.
         mean: (n,) state and parameters, in and out; factor: (n, n) lower root of their
             covariance, in and out.
 
@@ -110,11 +97,10 @@ def filter_square_root(  # type: ignore[no-untyped-def]
         innovations (T, ny) and their standard deviations, nis (T,) and log likelihood (T,), NaN
         where there is no reading.
     """
-    t, u, curvature, y = samples
     nx, observed = estimated.n_states, estimated.observed
     lower, upper = estimated.lower, estimated.upper
     process_sd, walk_sd, reading_sd = levels.process_sd, levels.walk_sd, levels.reading_sd
-    other, stride = levels.other, levels.stride
+    other, stride = 0.5 / levels.spread, levels.stride
     n = mean.shape[0]
     nw = process_sd.shape[0]
     ny = observed.shape[0]

@@ -31,7 +31,6 @@ from bampipe.estimate.square_root import (
     INNOVATION_NOT_POSITIVE,
     NOT_FINITE,
     Levels,
-    Samples,
     filter_square_root,
 )
 
@@ -312,16 +311,16 @@ def run_kernel(
     )  # fmt: skip
     levels = Levels(
         _array(settings.noise_sd), _array(settings.walk_sd), _array(settings.reading_sd),
-        spread, 0.5 / spread, float(settings.longest_step), int(stride),
+        spread, float(settings.longest_step), int(stride),
     )  # fmt: skip
-    samples = Samples(*map(_array, (trial.t, trial.u, trial.input_curvature, trial.y)))
+    samples = [*map(_array, (trial.t, trial.u, trial.input_curvature, trial.y))]
     ended, sample, found = filter_square_root(
         model.functions.derivative_rows, model.functions.measure_rows, estimated, p, levels,
-        samples, mean, root,
+        *samples, mean, root,
     )  # fmt: skip
     if ended != DONE:
         raise FilterFailure(0, sample, _REASONS[ended])
-    return FilteredTrial(samples.t[::stride], *found)
+    return FilteredTrial(samples[0][::stride], *found)
 
 
 def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:

@@ -17,9 +17,6 @@ from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.signals import ZERO_OF, Signals, calibration_changes
 
-_Source = tuple[str, System, Callable[[Motion], Motion]]
-"""Name of a source of uncertainty, and model and motion changed by one standard uncertainty."""
-
 
 def propagate_calibration(
     system: System,
@@ -38,17 +35,12 @@ def propagate_calibration(
     """
     count = int(np.sum(squares.free < len(system.parameters)))
     held = [int(k) for k in np.flatnonzero(squares.at_bound)]
-    found = {}
+    found, p, late_s = {}, squares.fit.evidence.p, squares.trials.late_s
     for name, theirs, change in _sources(system, recipe, session):
-        changed = (_residual(theirs, change(motion), squares) for motion in motions)
+        timed = (change(motion).with_input_timing(late_s) for motion in motions)
+        changed = (ModelOnTrial(theirs, p, [motion]).residual_once for motion in timed)
         found[name] = squares.respond(squares.residual_change(changed), held)[:count]
     return found
-
-
-def _residual(system: System, motion: Motion, squares: SquaresFit) -> Array:
-    """Return the residual (T, n_q) of a trial."""
-    timed = motion.with_input_timing(squares.trials.late_s)
-    return ModelOnTrial(system, squares.fit.evidence.p, [timed]).residual_once
 
 
 def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate:
@@ -66,7 +58,10 @@ def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate
     return replace(estimate, covariance=estimate.covariance + added, details=details)
 
 
-def _sources(system: System, recipe: Recipe, session: IngestResult) -> Iterator[_Source]:
+def _sources(
+    system: System, recipe: Recipe, session: IngestResult
+) -> Iterator[tuple[str, System, Callable[[Motion], Motion]]]:
+    """Yield sources of uncertainty, each with model and motion changed by its standard one."""
     signals = Signals.of_session(system, session)
     for name, change in calibration_changes(signals):
         yield name, system, partial(change.of_motion, signals=signals)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.filter_uncertainty import choose_block, sandwich_covariance
 from bampipe.estimate.unscented import (
     FilterFailure,
-    FilterModel,
     FilterSettings,
     Trial,
     constrain,
@@ -198,7 +197,7 @@ class Filtering:
     def find(self) -> tuple[FilterRun, _Width | None, _Widths]:
         """Return the run to publish, the narrower sign width if chosen, and the widths compared."""
         found = self.run(self.attempts, self.settings)
-        widths = self._widths_around(found)
+        widths = _Widths(self, found)
         width = None if self.system.model.device.prescribed else widths.choose()
         if width is None:
             return found, None, widths
@@ -212,13 +211,9 @@ class Filtering:
             if again.log_likelihood > found.log_likelihood + _LIKELIER:
                 first = found.first or found.passes
                 again = replace(again, restarts=found.restarts, repeats=1, first=first)
-                return again, width, self._widths_around(again, width.factor)
+                return again, width, _Widths(self, again, width.factor)
         self.model = declared
         return found, None, widths
-
-    def _widths_around(self, found: FilterRun, width: float = 1.0) -> _Widths:
-        some, step = _some_of(self.trials, found), self.choice.longest_step_s
-        return _Widths(found, self.model, width, some, self.narrowed, step)
 
 
 def estimate_by_filter(filtering: Filtering) -> Estimate:
@@ -343,24 +338,20 @@ class _Width:
     spread: Array
 
 
-@dataclass(frozen=True)
 class _Widths:
     """Comparison of widths of the smoothed sign on some trials, around an answer.
 
     Attributes:
-        found: the answer; model, width: of the filter that found it.
-        some: parts of trials, and the covariance (nt, nt) to start from, by `_some_of`.
-        narrowed: returns the system for a relative width; step: the longest step, s.
         filtered: log likelihood and answer, by width and division of the step.
+        step: the longest step, s.
     """
 
-    found: FilterRun
-    model: FilterModel
-    width: float
-    some: tuple[list[Trial], Array]
-    narrowed: Callable[[float], System]
-    step: float
-    filtered: dict[tuple[float, int], tuple[float, Array]] = field(default_factory=dict)
+    def __init__(self, filtering: Filtering, found: FilterRun, width: float = 1.0) -> None:
+        """Compare other widths with the relative ``width`` at which the answer was ``found``."""
+        self.found, self.model, self.width = found, filtering.model, width
+        self.narrowed, self.step = filtering.narrowed, filtering.choice.longest_step_s
+        self.some, self.covariance = _some_of(filtering.trials, found)
+        self.filtered: dict[tuple[float, int], tuple[float, Array]] = {}
 
     def filter(self, width: float, parts: int) -> tuple[float, Array]:
         """Log likelihood, minus infinity if the motion is lost, and answer, (nt,) physical."""
@@ -373,7 +364,7 @@ class _Widths:
                 self.found.settings, longest_step=self.step / parts, stride=_MOVED_SAMPLES
             )
             with suppress(FilterFailure):
-                outcome = filter_trials(model, self.some[0], theta, self.some[1], settings)
+                outcome = filter_trials(model, self.some, theta, self.covariance, settings)
                 likely = sum(float(np.nansum(one.log_likelihood)) for one in outcome.trials)
                 theta = outcome.theta
             self.filtered[width, parts] = likely, model.to_physical(theta)[0]

@@ -1,6 +1,5 @@
 """The expected gain of a proposed trial, as it is stored."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,26 +68,23 @@ class Forecast:
             levels=dict(design.levels or {}),
             worth=ranked.utility,
             information_gain=float(np.median([self.precision.gain(one) for one in added])),
-            sd=self._sd(added, design.seconds) if has_forecast else {},
+            sd=self.tabulate_sd(
+                *(self.precision.expect(one, design.seconds) for one in added if has_forecast)
+            ),
             confusion=self.comparison.expect(ranked.expected_motions) if self.comparison else (),
             farther=farther,
             faster=faster,
         )
 
-    def _sd(self, added: Sequence[Array], seconds: float) -> dict[str, ExpectedSd]:
-        every = [self.precision.expect(one, seconds) for one in added]
-        return self.tabulate_sd(
-            Expected(
-                np.min([one.low for one in every], axis=0),
-                np.median([one.median for one in every], axis=0),
-                np.max([one.high for one in every], axis=0),
-            )
-        )
-
-    def tabulate_sd(self, found: Expected) -> dict[str, ExpectedSd]:
-        """Return the record of expected standard deviations, by parameter."""
+    def tabulate_sd(self, *every: Expected) -> dict[str, ExpectedSd]:
+        """Return the record of standard deviations expected of versions of a trial, if any."""
+        if not every:
+            return {}
         units = {q.name: q.unit for q in self.rehearsal.system.parameters}
-        columns = (self.precision.names, self.precision.sd, found.low, found.median, found.high)
+        low = np.min([one.low for one in every], axis=0)
+        medians = np.median([one.median for one in every], axis=0)
+        high = np.max([one.high for one in every], axis=0)
+        columns = (self.precision.names, self.precision.sd, low, medians, high)
         return {
             name: ExpectedSd(before=now, after=median, low=low, high=high, unit=units[name])
             for name, now, low, median, high in zip(*columns, strict=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -177,9 +178,8 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     else:
         pairs = zip(forecast.tabulate_sd(found.sd).items(), goal.sd, strict=True)
         sd = {name: PlannedSd.of(entry, asked=asked) for (name, entry), asked in pairs}
-    counted: dict[int, tuple[Primitive, int]] = {}
-    for design in found.designs:
-        counted[id(design)] = design, counted.get(id(design), (design, 0))[1] + 1
+    designs = {id(design): design for design in found.designs}
+    times = Counter(map(id, found.designs))
     return Plan(
         sentence=_say_plan(found, seconds, "uncertainties" if comparison is None else "confusion"),
         seconds=seconds,
@@ -191,10 +191,10 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
                     replace(design, seconds=design.part_s, parts=1), seen, system.model.device
                 ),
                 seconds=design.part_s,
-                times=times * design.parts,
+                times=times[key] * design.parts,
                 moves=describe_moves(design, forecast.rehearsal),
             )
-            for design, times in counted.values()
+            for key, design in designs.items()
         ),
         sd=sd,
         confusion=confusion,

@@ -129,17 +129,9 @@ def _print_intermediate(value: Any) -> tuple[str, frozenset[Any]]:
     return _Printer().doprint(value), frozenset(value.free_symbols)
 
 
-@dataclass(frozen=True)
-class Bodies:
-    """A compiled function of a robot's bodies, the same text for all models of the robot.
-
-    Attributes:
-        names: intermediates that it gives, in order; none where the device is no robot.
-        source: of the module.
-    """
-
-    names: tuple[Any, ...]
-    source: str
+Bodies = tuple[tuple[Any, ...], str]
+"""A compiled function of a robot's bodies, the same text for all models of the robot: the
+intermediates that it gives, in order, none where the device is no robot; and its module."""
 
 
 def bodies_at_state(e: Equations) -> Bodies:
@@ -147,16 +139,14 @@ def bodies_at_state(e: Equations) -> Bodies:
     names, block = _print_bodies(e, [*_upper_entries(e), *e.bias])
     lines = [*unpack_groups({"x": [*e.q, *e.qd], "p": e.p}, block.used), *block.lines]
     lines += [f"return ({', '.join(block.values)},)"]
-    returned = f"types.UniTuple(types.float64, {len(names)})"
-    head = f"\n\n@njit({returned}(V, V), cache=True, error_model='numpy')"
-    body = "\n    ".join(lines)
-    return Bodies(names, f"{SCALAR_HEADER}{head}\ndef bodies(x, p):\n    {body}\n")
+    returned = f"types.UniTuple(types.float64, {len(names)})(V, V)"
+    return names, SCALAR_HEADER + _compile(returned, "", "bodies", "x, p", lines)
 
 
 def bodies_along_motion(e: Equations) -> Bodies:
     """``bodies(q, qd, qdd, p, out)``: the forces that a robot's bodies require, (T, names)."""
     names, block = _print_bodies(e, e.dynamics)
-    return Bodies(names, _print_along_motion("bodies", _select_groups(e, "q qd qdd"), e.p, block))
+    return names, _print_along_motion("bodies", _select_groups(e, "q qd qdd"), e.p, block)
 
 
 def _print_along_motion(
@@ -237,8 +227,7 @@ def print_portable(e: Equations, parameters: Mapping[Any, float]) -> Block:
         e: the equations of a model without internal states; parameters: value of each symbol.
     """
     numbers = {symbol: sp.Float(value) for symbol, value in parameters.items()}
-    forces = zip(e.dynamics, e.quiet_other, strict=True)
-    required = [sp.sympify(f - o, strict=True).xreplace(numbers) for f, o in forces]
+    required = [sp.sympify(force, strict=True).xreplace(numbers) for force in e.required]
     steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
     return print_block(required, steps, kind=_PortablePrinter)
 
@@ -287,11 +276,10 @@ def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
 
 def dynamics_source(e: Equations) -> str:
     """Source of the functions over columns of the whole mechanism: long where it is a robot."""
-    forces = zip(e.dynamics, e.quiet_other, strict=True)
     results = {
-        "required": ("q qd qdd z u p", [f - o for f, o in forces]),
+        "required": ("q qd qdd z u p", e.required),
         "mass_matrix": ("q p", [m for row in e.mass for m in row]),
-        "energy": ("q qd p", [e.kinetic, e.potential]),
+        "readings": ("q qd u p", _encoder_readings(e)),
     }
     return _print_over_columns(e, results, e.steps)
 
@@ -301,8 +289,12 @@ def compiled_function(
 ) -> str:
     """A compiled function; its arguments are vectors unless ``kinds`` says otherwise."""
     kinds = kinds or ", ".join(["V"] * len(arguments.split(",")))
-    head = f"\n\n@njit(types.void({kinds}), cache=True, error_model='numpy', {options})"
-    return f"{head}\ndef {name}({arguments}):\n    " + "\n    ".join(body or ["pass"]) + "\n"
+    return _compile(f"types.void({kinds})", options, name, arguments, body or ["pass"])
+
+
+def _compile(signature: str, options: str, name: str, arguments: str, body: Sequence[str]) -> str:
+    head = f"\n\n@njit({signature}, cache=True, error_model='numpy', {options})"
+    return f"{head}\ndef {name}({arguments}):\n    " + "\n    ".join(body) + "\n"
 
 
 def _indent_loop(head: str, body: Sequence[str]) -> list[str]:
@@ -364,7 +356,8 @@ def _print_motion(e: Equations, index: str = "{}", known: Sequence[Any] = ()) ->
     """
     n = len(e.q)
     upper = [(i, j) for i in range(n) for j in range(i, n)]
-    force = [a + o - h for a, o, h in zip(e.applied_noise, e.other, e.bias, strict=True)]
+    terms = zip(e.applied, e.other, e.noise_force, e.bias, strict=True)
+    force = [a + o + noise - h for a, o, noise, h in terms]
     results = [*_upper_entries(e), *force, *e.rates]
     block = print_block([*results, *e.qd], e.steps, known)
     values = block.values[: len(results)]
@@ -419,16 +412,16 @@ def rows_sources(e: Equations, rows: int) -> dict[str, str]:
     return sources
 
 
-def scalar_sources(e: Equations, bodies: Bodies, title: str = "") -> dict[str, str]:
+def scalar_sources(e: Equations, known: Sequence[Any], title: str) -> dict[str, str]:
     """Sources of the compiled functions of one state, by name.
 
     The measurement has the same text for many models, which is compiled once.
 
     Args:
-        e: the equations; bodies: `bodies_at_state`; title: of its module.
+        e: the equations; known: intermediates that the module ``title`` of `bodies_at_state` gives.
     """
     header = SCALAR_HEADER + (f"from {title} import bodies\n" if title else "")
-    motion = _print_motion(e, known=bodies.names)
+    motion = _print_motion(e, known=known)
     return {
         "derivative": header + compiled_function("derivative", "x, u, p, w, dx", motion),
         "measure": SCALAR_HEADER + filling_function("measure", *_encoder_groups(e)),
@@ -441,8 +434,6 @@ def residual_source(e: Equations, bodies: Sequence[Any]) -> str:
     Args:
         e: the equations; bodies: names of what ``b`` holds, by `bodies_along_motion`.
     """
-    forces = zip(e.applied, e.quiet_other, e.dynamics, strict=True)
-    residual = [a + o - f for a, o, f in forces]
-    block = print_block(residual, e.steps, bodies)
+    block = print_block(e.residual, e.steps, bodies)
     groups = {**_select_groups(e, "q qd qdd"), "b": bodies, **_select_groups(e, "z u")}
     return _print_along_motion("residual", groups, e.p, block)

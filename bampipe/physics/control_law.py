@@ -19,8 +19,8 @@ class ControlLaw:
         inputs: names of the columns of r: the controller's channels, the device's other
             channels, time.
         forces: force channels in the order of the commands.
-        rate_hz: how often the controller acts; 0 if unknown. states: names of the controller's
-        states; limits: (n_s, 2) of these.
+        rate_hz: how often the controller acts; 0 if unknown.
+        limits: (n_s, 2) of the controller's states.
         command: c(y, r, s, out), numba-compiled: y are measured positions then rates (2 n_q,),
             s (n_s,) the states, out (n_f + n_s,) receives the commands in the units of the
             channels and the rates of the states.
@@ -29,7 +29,6 @@ class ControlLaw:
     inputs: tuple[str, ...]
     forces: tuple[str, ...]
     rate_hz: float
-    states: tuple[str, ...]
     limits: tuple[tuple[float, float], ...]
     command: Callable[..., None]
 
@@ -47,9 +46,8 @@ def compile_law(device: Device) -> ControlLaw | None:
     key = hash_content(["law", device.declaration])
     code = generated_code.load(key, lambda: ({}, {"law": _print_law(device, inputs)}))
     command = code.module("law").command
-    states = controller.states
-    limits = tuple((state.lower, state.upper) for state in states.values())
-    return ControlLaw(inputs, device.forces, controller.rate_hz, tuple(states), limits, command)
+    limits = tuple((state.lower, state.upper) for state in controller.states.values())
+    return ControlLaw(inputs, device.forces, controller.rate_hz, limits, command)
 
 
 def _print_law(device: Device, inputs: tuple[str, ...]) -> str:

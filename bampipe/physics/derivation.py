@@ -21,13 +21,11 @@ from bampipe.physics.lagrange import allow, check_inertia, lagrange
 from bampipe.physics.model import Model
 from bampipe.physics.newton_euler import (
     INERTIAL,
-    Algebra,
     Link,
     Text,
     Vector,
     joint_forces,
     mass_matrix,
-    potential_energy,
 )
 from bampipe.physics.robot import gravity_vector
 from bampipe.physics.roles import find_compensation, find_delays
@@ -65,79 +63,42 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
 
 
 def _assemble_equations(d: Vocabulary) -> Equations:
-    forces = _map_inputs(d)
-    terms = _collect_terms(d, forces)
+    device, acting = d.model.device, ActingInputs(d, d.model.effects)
+    noise = [*device.forces, *device.process_noise]
+    w = [sp.Symbol(f"w{i}", real=True) for i in range(len(noise))]
+    noise_force = acting.find_noise(w)
+    for name, symbol in zip(device.process_noise, w[len(device.forces) :], strict=True):
+        gains = d.table(device.process_noise[name].torque, f"process_noise.{name}")
+        noise_force = [e + g * symbol for e, g in zip(noise_force, gains, strict=True)]
+    terms = _collect_terms(d, acting)
     inertia = _take_inertia(d, terms.other)
-    _check_dependence(d, forces, terms)
-    motion = _add_inertia(d, _combine_motion(d, terms.energies), inertia)
+    _check_dependence(d, acting, terms, noise_force, w)
+    motion = _combine_motion(d, terms.energies, inertia)
     offset_rate = [d.ddt(e) if e != 0 else e for e in terms.offset]
     rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
-    parts = [*forces.noisy, *terms.other, *rates, *initial, *terms.offset, *offset_rate]
-    used_symbols = _collect_symbols([*parts, *forces.logged])
-    inputs = [c for c in d.channels if d.channel[c] in used_symbols or c in d.model.device.forces]
-    residual = [
-        a + o - f for a, o, f in zip(forces.applied, terms.other, motion.dynamics, strict=True)
-    ]
+    force = _add(acting.applied, terms.other)
+    parts = [*force, *noise_force, *rates, *initial, *terms.offset, *offset_rate]
+    used_symbols = _collect_symbols([*parts, *acting.logged])
+    inputs = [c for c in d.channels if d.channel[c] in used_symbols or c in device.forces]
+    residual = [f - r for f, r in zip(force, motion.dynamics, strict=True)]
+    kinetic, potential = (sp.Add(*(e[k] for e in terms.energies)) for k in (2, 3))
     return Equations(
         q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=[".".join(key) for key in d.z],
         u=[d.channel[c] for c in inputs], inputs=inputs,
-        p=list(d.p.values()), w=forces.w, noise=forces.noise,
+        p=list(d.p.values()), w=w, noise=noise,
         steps=motion.steps, mass=motion.mass, bias=motion.bias, dynamics=motion.dynamics,
-        other=terms.other, applied=forces.applied, applied_noise=forces.noisy,
-        input_map=forces.input_map, rates=rates, initial=initial,
+        other=terms.other, applied=acting.applied, noise_force=noise_force,
+        input_map=acting.input_map, rates=rates, initial=initial,
         offset=terms.offset, offset_rate=offset_rate,
-        kinetic=motion.kinetic, potential=motion.potential,
-        dependence=_find_dependence(d, residual, [*rates, *terms.offset], motion.steps, forces.w),
-        compensation=find_compensation(d, motion.potential, forces.logged, forces.side),
-        delays=find_delays(d, forces.applied),
+        kinetic=kinetic, potential=potential,
+        dependence=_find_dependence(d, residual, [*rates, *terms.offset], motion.steps),
+        compensation=find_compensation(d, potential, acting),
+        delays=find_delays(d, acting.applied),
     )  # fmt: skip
 
 
 def _collect_symbols(expressions: Iterable[Any]) -> set[Any]:
     return set().union(*(e.free_symbols for e in expressions))
-
-
-@dataclass(frozen=True)
-class _Forces:
-    """Generalised forces of the inputs, one expression per axis.
-
-    Attributes:
-        logged: of the inputs as they are logged; side: their load across the motion. signals: the
-        acting part of each logged input. applied: of the acting inputs; noisy: the same with the
-        noise ``w`` on each measured force.
-        input_map: d logged / d force.
-        noise, w: names and symbols of the process noise, that of the forces first.
-    """
-
-    logged: list[Any]
-    side: list[Any]
-    signals: ActingInputs
-    applied: list[Any]
-    noisy: list[Any]
-    input_map: list[list[Any]]
-    noise: list[str]
-    w: list[Any]
-
-
-def _map_inputs(d: Vocabulary) -> _Forces:
-    """Map the measured inputs to the axes."""
-    device = d.model.device
-    logged, side = d.table(device.applied, "applied"), d.table(device.side_load, "side_load")
-    signals = ActingInputs(d, d.model.effects, logged, side)
-    measured = [d.channel[f] for f in device.forces]
-    noise = [*device.forces, *device.process_noise]
-    w = [sp.Symbol(f"w{i}", real=True) for i in range(len(noise))]
-    acting = signals.acting | {
-        f: signals.acting.get(f, f) + symbol for f, symbol in zip(measured, w, strict=False)
-    }
-    noisy, input_map = [], []
-    for expr in logged:
-        symbols = expr.free_symbols
-        values = {symbol: value for symbol, value in acting.items() if symbol in symbols}
-        noisy.append(expr.subs(values, simultaneous=True))
-        input_map.append([sp.diff(expr, f) if f in symbols else sp.S.Zero for f in measured])
-    applied = [signals.put_in(e) for e in logged]
-    return _Forces(logged, side, signals, applied, noisy, input_map, noise, w)
 
 
 class _Energy(NamedTuple):
@@ -165,20 +126,20 @@ class _Terms:
     states: dict[Any, tuple[Any, Any]]
 
 
-def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
+def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
     """Build the expressions of the device and of each effect, in the order in which they act."""
-    device, signals = d.model.device, forces.signals
+    device = d.model.device
     acting = [e for e in order_of_action(d.model.effects) if e.effect.kind != "input"]
     kinetic = d.build(device.kinetic, d.base, "energy.kinetic")
     potential = d.build(device.potential, d.base, "energy.potential")
     label = f"device {device.name!r}: energy.kinetic"
     energies = [_Energy(label, device.kinetic, kinetic, potential)] if device.energy else []
-    other, offset = _build_device_torque(d, forces.w), [sp.S.Zero for _ in d.axes]
+    other, offset = _build_device_torque(d), [sp.S.Zero for _ in d.axes]
     measures = any(e.effect.kind == "measurement" for e in acting)
-    prompt_force = _find_prompt_forces(d, forces) if measures else []
+    prompt_force = _find_prompt_forces(d) if measures else []
     # All is in terms of the logged inputs until they are replaced by their acting parts.
-    delivered_force, pull = list(forces.logged), [sp.S.Zero for _ in d.axes]
-    states = {z: (rate, signals.initial[z]) for z, rate in signals.rates.items()}
+    delivered_force, pull = list(inputs.logged), [sp.S.Zero for _ in d.axes]
+    states = {z: (rate, inputs.initial[z]) for z, rate in inputs.rates.items()}
     for item in acting:
         effect, by_axis = item.effect, offset if item.effect.kind == "measurement" else other
         if "dry" in effect.names:
@@ -191,7 +152,7 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
             d.inertia = [row[i] for i, row in enumerate(known.mass)]
             d.bias = [h - t for h, t in zip(known.bias, torque, strict=True)]
         symbols = d.effect_symbols(
-            item, prompt_force if by_axis is offset else delivered_force, forces.side
+            item, prompt_force if by_axis is offset else delivered_force, inputs.side
         )
         if effect.ahead is not None:
             for i, added in enumerate(_move_bias(d, item, effect.ahead, symbols)):
@@ -214,11 +175,8 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
                 pull[axis] += value
             if by_axis is other and effect.acting_link:
                 delivered_force[axis] += value
-        for state in effect.states:
-            rate, initial = d.build_state(item, state, symbols)
-            z = d.z[item.prefix, state.name]
-            states[z] = signals.put_in(rate), signals.put_in_initial(initial)
-    other = [signals.put_in(e) for e in other]
+        states |= {z: (rate, start) for z, rate, start in inputs.build_states(item, symbols)}
+    other = [inputs.put_in(e) for e in other]
     return _Terms(energies, other, offset, {z: states[z] for z in d.z.values()})
 
 
@@ -234,22 +192,21 @@ def _move_bias(d: Vocabulary, item: BoundEffect, ahead: Ahead, symbols: Symbols)
     return [share * (h - m) for h, m in zip(d.bias, moved, strict=True)]
 
 
-def _find_prompt_forces(d: Vocabulary, forces: _Forces) -> list[Any]:
+def _find_prompt_forces(d: Vocabulary) -> list[Any]:
     """Generalised forces that an offset may follow, by axis.
 
     An offset is differentiated. It cannot follow the rates, so its load excludes a motor's back
     EMF; nor states, so a lagging force counts as logged; and a delayed force is delayed to one
     order less in it.
     """
-    memoryless = [e for e in d.model.effects if not e.effect.states]
-    signals = ActingInputs(d, memoryless, forces.logged, forces.side)
+    inputs = ActingInputs(d, (e for e in d.model.effects if not e.effect.states))
     lost = [d.channel[derivative(f, LAST_ORDER)] for f in d.model.device.forces]
     zeros = dict.fromkeys([*d.qd, *lost], 0)
-    return [signals.put_in(e).subs(zeros) for e in forces.logged]
+    return [e.subs(zeros) for e in inputs.applied]
 
 
-def _build_device_torque(d: Vocabulary, w: Sequence[Any]) -> list[Any]:
-    """Q_other of the device without effects: its own torques, friction, brakes, noise."""
+def _build_device_torque(d: Vocabulary) -> list[Any]:
+    """Q_other of the device without effects: its own torques, friction, brakes."""
     device = d.model.device
     other = d.table(device.torque, "torque")
     for i, c in enumerate(device.coordinates):
@@ -258,9 +215,6 @@ def _build_device_torque(d: Vocabulary, w: Sequence[Any]) -> list[Any]:
             other[i] -= d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
         if c.name in device.brakes:
             other[i] -= d.channel[device.brakes[c.name]] * sign
-    for k, name in enumerate(device.process_noise):
-        gains = d.table(device.process_noise[name].torque, f"process_noise.{name}")
-        other = [e + g * w[len(device.forces) + k] for e, g in zip(other, gains, strict=True)]
     return other
 
 
@@ -270,7 +224,9 @@ def _find_dry_friction(d: Vocabulary, other: Sequence[Any]) -> list[Any]:
     return [(e.subs(s, -1) - e.subs(s, 1)) / 2 for e, s in zip(other, signs, strict=True)]
 
 
-def _check_dependence(d: Vocabulary, forces: _Forces, terms: _Terms) -> None:
+def _check_dependence(
+    d: Vocabulary, inputs: ActingInputs, terms: _Terms, noise_force: list[Any], w: list[Any]
+) -> None:
     """Refuse expressions with names that their place in the equations does not allow."""
     device = d.model.device
     others = [d.channel[c] for c in device.channels]
@@ -280,13 +236,14 @@ def _check_dependence(d: Vocabulary, forces: _Forces, terms: _Terms) -> None:
     words = "motion, inputs, parameters and internal states"
     rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
     kinetic, potential = ([getattr(e, k) for e in terms.energies] for k in ("kinetic", "potential"))
-    gains = [gain for row in forces.input_map for gain in row]
+    gains = [gain for row in inputs.input_map for gain in row]
     by_gain = "positions, parameters and channels that are no forces"
     allow("the kinetic energy", kinetic, [*motion, *free], "positions, rates and parameters")
     allow("the potential energy", potential, [*d.q, *free], "positions and parameters")
     allow("the effect of a force on the axes", gains, [*d.q, *others, *free], by_gain)
-    allow("a torque", terms.other, [*all_symbols, *forces.w], words)
-    allow("the applied force", forces.applied, all_symbols, words)
+    allow("a torque", terms.other, all_symbols, words)
+    allow("a process noise", noise_force, [*all_symbols, *w], words)
+    allow("the applied force", inputs.applied, all_symbols, words)
     allow("the rate of an internal state", rates, all_symbols, words)
     allow("an initial value", initial, [*d.q, *u, *free], "positions, inputs and parameters")
     symbols_allowed = [*d.q, *prompt_force, *others, d.channel["t"], *free]
@@ -300,24 +257,27 @@ class _Motion(NamedTuple):
     mass: list[list[Any]]
     bias: list[Any]
     dynamics: list[Any]
-    kinetic: Any
-    potential: Any
 
 
-def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
-    """Add the terms of the energies and of a robot's bodies."""
-    energy_motion, robot = _apply_lagrange(d, energies), d.model.device.robot
+def _combine_motion(d: Vocabulary, energies: Sequence[_Energy], taken: Sequence[Any]) -> _Motion:
+    """Add the terms of the energies, of a robot's bodies and of `_take_inertia`."""
+    motion, robot = _apply_lagrange(d, energies), d.model.device.robot
     if robot is None:
-        check_inertia(d.model, energy_motion.mass, [*d.q, *d.constants])
-        return energy_motion
-    numbers = tuple(d.p[p.name] for p in robot.parameters)
-    motion = tuple(d.q), tuple(d.qd), tuple(d.qdd)
-    bodies = _apply_newton_euler(robot.links, gravity_vector(robot), numbers, motion)
-    return _Motion(
-        bodies.steps, [_add(*rows) for rows in zip(energy_motion.mass, bodies.mass, strict=True)],
-        _add(energy_motion.bias, bodies.bias), _add(energy_motion.dynamics, bodies.dynamics),
-        energy_motion.kinetic + bodies.kinetic, energy_motion.potential + bodies.potential,
-    )  # fmt: skip
+        check_inertia(d.model, motion.mass, [*d.q, *d.constants])
+    else:
+        numbers = tuple(d.p[p.name] for p in robot.parameters)
+        coordinates = tuple(d.q), tuple(d.qd), tuple(d.qdd)
+        bodies = _apply_newton_euler(robot.links, gravity_vector(robot), numbers, coordinates)
+        motion = _Motion(
+            bodies.steps, [_add(*rows) for rows in zip(motion.mass, bodies.mass, strict=True)],
+            _add(motion.bias, bodies.bias), _add(motion.dynamics, bodies.dynamics),
+        )  # fmt: skip
+    mass = [
+        [m - (taken[i] if i == j else 0) for j, m in enumerate(row)]
+        for i, row in enumerate(motion.mass)
+    ]
+    parts = zip(motion.dynamics, taken, d.qdd, strict=True)
+    return motion._replace(mass=mass, dynamics=[f - x * qdd for f, x, qdd in parts])
 
 
 def _take_inertia(d: Vocabulary, other: list[Any]) -> list[Any]:
@@ -328,17 +288,6 @@ def _take_inertia(d: Vocabulary, other: list[Any]) -> list[Any]:
     allowed = [*d.q, *d.p.values(), *d.constants]
     allow("what a torque has per acceleration", found, allowed, "positions and parameters")
     return found
-
-
-def _add_inertia(d: Vocabulary, motion: _Motion, taken: Sequence[Any]) -> _Motion:
-    """Add the result of `_take_inertia` to the mass matrix."""
-    mass = [
-        [m - (taken[i] if i == j else 0) for j, m in enumerate(row)]
-        for i, row in enumerate(motion.mass)
-    ]
-    products = [x * qdd for x, qdd in zip(taken, d.qdd, strict=True)]
-    dynamics = [f - x for f, x in zip(motion.dynamics, products, strict=True)]
-    return motion._replace(mass=mass, dynamics=dynamics)
 
 
 def _add(one: Sequence[Any], other: Sequence[Any]) -> list[Any]:
@@ -364,9 +313,7 @@ def _apply_lagrange(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
         h + sum(m * x for m, x in zip(row, d.qdd, strict=True))
         for h, row in zip(bias, mass, strict=True)
     ]
-    kinetic = sum((e.kinetic for e in energies), sp.S.Zero)
-    potential = sum((e.potential for e in energies), sp.S.Zero)
-    return _Motion([], mass, bias, dynamics, kinetic, potential)
+    return _Motion([], mass, bias, dynamics)
 
 
 @cache
@@ -379,19 +326,15 @@ def _apply_newton_euler(
     """Newton and Euler's equations of a robot's bodies, once a process for all its models."""
     q, qd, qdd = motion
     text = Text()
-    algebra = Algebra.symbols(text)
     inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
     zeros = [0] * len(q)
     # Everything has a name: one compiled function serves every model of this robot.
-    mass = [[text.name(m) for m in row] for row in mass_matrix(algebra, links, inertial, q)]
+    mass = [[text.name(m) for m in row] for row in mass_matrix(text, links, inertial, q)]
     bias, dynamics = (
-        [text.name(f) for f in joint_forces(algebra, links, inertial, q, qd, a, gravity)]
+        [text.name(f) for f in joint_forces(text, links, inertial, q, qd, a, gravity)]
         for a in (zeros, qdd)
     )
-    momentum = [sum(m * v for m, v in zip(row, qd, strict=True)) for row in mass]
-    kinetic = sum(p * v for p, v in zip(momentum, qd, strict=True)) / 2
-    potential = potential_energy(algebra, links, inertial, q, gravity)
-    return _Motion(text.steps, mass, bias, dynamics, kinetic, potential)
+    return _Motion(text.steps, mass, bias, dynamics)
 
 
 @lru_cache(maxsize=4096)
@@ -405,20 +348,17 @@ def _find_dependence(
     residual: Sequence[Any],
     beside: Sequence[Any],
     steps: Sequence[tuple[Any, Any]],
-    w: Sequence[Any],
 ) -> Dependence:
     """Find how the residual depends on each parameter.
 
     Args:
         residual: one expression an axis; beside: other expressions of the model, in which a
-            parameter makes it nonlinear; steps: named intermediates in the residual; w: the noise,
-            which slopes leave out.
+            parameter makes it nonlinear; steps: named intermediates in the residual.
     """
     step_names, numbers = {name for name, _ in steps}, _collect_symbols(v for _, v in steps)
     found = Dependence([], [], [], [], [], [])
     p, varying = [*d.p.values()], {*d.p.values(), *d.z.values()}
-    inputs, no_noise = {*d.channel.values()}, dict.fromkeys(w, 0)
-    elsewhere = _collect_symbols(beside)
+    inputs, elsewhere = {*d.channel.values()}, _collect_symbols(beside)
     # A term has few of the model's parameters, and sympy is slow to find a slope zero.
     terms = [[(t, t.free_symbols) for t in sp.Add.make_args(e)] for e in residual]
     for i, symbol in enumerate(p):
@@ -438,8 +378,6 @@ def _find_dependence(
         found.linear.append(linear)
         found.constant.append(constant)
         found.unforced.append(constant and slope_symbols.isdisjoint(inputs))
-        if lasts and not slope_symbols.isdisjoint(w):
-            by_axis = {k: slope.subs(no_noise) for k, slope in by_axis.items()}
         found.lasting.append(by_axis if lasts else None)
         found.products.extend((j, i) for j in range(i) if p[j] in curving)
         if bodily and not by_axis:

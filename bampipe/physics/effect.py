@@ -2,9 +2,10 @@
 
 import ast
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import permutations
 from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, StringConstraints, Tag
@@ -230,29 +231,33 @@ class Effect(DeclaredFile):
 
     def targets(self, device: Device) -> tuple[str, ...]:
         """Names after the colon that make sense for ``device``; ``("",)`` for a device effect."""
+        return tuple(self.places(device))
+
+    def places(self, device: Device) -> Mapping[str, tuple[str, ...]]:
+        """The axes, or input channels, that each target of ``device`` stands for."""
         if (self.devices and device.name not in self.devices) or (self.drive and not device.drive):
-            return ()
+            return {}
         if self.robot is not None and self.robot != (device.robot is not None):
-            return ()
+            return {}
         if self.scope == "axis":
-            return tuple(
-                c.name
+            return {
+                c.name: (c.name,)
                 for c in device.coordinates
                 if not self._lacks_kind(c.kind)
                 and ("brake" not in self.names or c.name in device.brakes)
                 and ("dry" not in self.names or device.has_dry_friction(c.name))
-            )
+            }
         if self.scope == "axis_pair":
-            return tuple(self.pairs(device))
+            return self._pair_axes(device)
         if self.scope == "channel":
-            return tuple(device.channels)
+            return {name: (name,) for name in device.channels}
         if self.scope == "force_component":
-            return device.components
+            return {n: (f,) for n, f in zip(device.components, device.forces, strict=True)}
         if self.scope == "force_pair":
-            return tuple(force_pairs(device))
-        return ("",) if self._fits_device(device) else ()
+            return _pair_forces(device)
+        return {"": ()} if self._fits_device(device) else {}
 
-    def pairs(self, device: Device) -> dict[str, tuple[str, str]]:
+    def _pair_axes(self, device: Device) -> dict[str, tuple[str, str]]:
         """The pairs of axes of ``device`` that it makes sense for, by what follows the colon.
 
         Neighbouring joints where it acts on both, else axes that lie near each other, either way.
@@ -260,13 +265,7 @@ class Effect(DeclaredFile):
         if self.kind == "energy" or (isinstance(self.torque, Mapping) and len(self.torque) > 1):
             return _list_neighbours(device)
         names = [c.name for c in device.coordinates]
-        farthest = _FARTHEST if device.robot is None else 1
-        return {
-            f"{a}-{b}": (a, b)
-            for i, a in enumerate(names)
-            for j, b in enumerate(names)
-            if 0 < abs(i - j) <= farthest
-        }
+        return _pair_near(names, names, _FARTHEST if device.robot is None else 1, "-")
 
     @cached_property
     def names(self) -> set[str]:
@@ -290,11 +289,6 @@ class Effect(DeclaredFile):
     def uses_inertia(self) -> bool:
         """Whether it acts on what the energies require of its axis."""
         return self.ahead is not None or bool(self.names & {"axis_inertia", "axis_bias"})
-
-    @property
-    def uses_pull(self) -> bool:
-        """Whether it acts on what pulls by position, springs included."""
-        return "pull" in self.terms
 
     @property
     def pulls(self) -> bool:
@@ -321,18 +315,24 @@ class Effect(DeclaredFile):
         return keys <= places and self.names <= known | {*device.brakes.values()}
 
 
-def force_pairs(device: Device) -> dict[str, tuple[str, str]]:
+def _pair_forces(device: Device) -> dict[str, tuple[str, str]]:
     """Pairs of a force channel and one that may leak into it, by the text after the colon.
 
     The drives of a robot may share a gear with their neighbours, not with all others.
     """
     names, forces = device.components, device.forces
-    between, near = ("", len(names)) if device.robot is None else ("-", 1)
+    farthest, between = (len(names), "") if device.robot is None else (1, "-")
+    return _pair_near(names, forces, farthest, between)
+
+
+def _pair_near(
+    names: Sequence[str], values: Sequence[str], farthest: int, between: str
+) -> dict[str, tuple[str, str]]:
+    """Ordered pairs of values at most so far apart, by their names with ``between`` them."""
     return {
-        f"{a}{between}{b}": (forces[i], forces[j])
-        for i, a in enumerate(names)
-        for j, b in enumerate(names)
-        if 0 < abs(i - j) <= near
+        f"{names[i]}{between}{names[j]}": (values[i], values[j])
+        for i, j in permutations(range(len(names)), 2)
+        if abs(i - j) <= farthest
     }
 
 
@@ -355,13 +355,18 @@ class BoundEffect:
     Attributes:
         effect, target: the effect and its place, the text after the colon.
         parameters: its parameters with their full names.
-        axes: the one or two axes that it acts on, if its scope has any.
+        places: the axes, or input channels, that the target stands for.
     """
 
     effect: Effect
     target: str
     parameters: tuple[Parameter, ...]
-    axes: tuple[str, ...] = ()
+    places: tuple[str, ...]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The one or two axes that it acts on, if its scope has any."""
+        return self.places if self.effect.scope in ("axis", "axis_pair") else ()
 
     @property
     def name(self) -> str:
@@ -398,7 +403,7 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
         InputError: the target does not exist there, or a parameter lacks its entry for that kind
             of axis.
     """
-    targets = effect.targets(device)
+    targets = effect.places(device)
     if not targets:
         raise InputError(
             f"effect {effect.name!r} needs something that device {device.name!r} does not have"
@@ -415,9 +420,8 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
             else f"effect {effect.name!r} needs a target",
             remedy=f"choose from {choices}",
         )
-    axes: tuple[str, ...] = (target,) if effect.scope == "axis" else ()
-    if effect.scope == "axis_pair":
-        axes = effect.pairs(device)[target]
+    places = targets[target]
+    axes = places if effect.scope in ("axis", "axis_pair") else ()
     kind = device.coordinate(axes[0]).kind if axes else ""
     prefix = f"{effect.name}.{target}" if target else effect.name
     bound = []
@@ -428,7 +432,7 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
                 f"no entry for a {kind or 'device'} parameter",
                 where=f"effect {effect.name!r}: parameters.{name}",
             )
-        unit = unit_of(chosen.unit, effect, target, device)
+        unit = unit_of(chosen.unit, effect, places, device)
         about = chosen.description or entry.description
         # The weight of a robot's bodies is excluded, since no effect can be separated from it.
         others = pulled if device.robot is None else ()
@@ -438,18 +442,18 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
                 f"{prefix}.{name}", unit=unit, description=about, fixed=chosen.fixed or held
             )
         )
-    return BoundEffect(effect, target, tuple(bound), axes)
+    return BoundEffect(effect, target, tuple(bound), places)
 
 
-def unit_of(unit: str, effect: Effect, target: str, device: Device) -> str:
+def unit_of(unit: str, effect: Effect, places: Sequence[str], device: Device) -> str:
     """``unit`` of a parameter or state with ``input`` replaced by that of the channel acted on.
 
     For a pair of axes, ``other`` stands for the unit of the second.
     """
-    own = device.channels[target] if effect.scope == "channel" else device.force_unit
+    own = device.channels[places[0]] if effect.scope == "channel" else device.force_unit
     units = {"input": own}
     if effect.scope == "axis_pair":
-        units["other"] = device.coordinate(effect.pairs(device)[target][1]).unit
+        units["other"] = device.coordinate(places[1]).unit
     above: list[str] = []
     below: list[str] = []
     for sign, part in _split_unit(unit):
@@ -462,7 +466,7 @@ def state_units(item: BoundEffect, device: Device) -> dict[str, str]:
     """The unit of every state of a bound effect, by the name of the state."""
     kind = device.coordinate(item.axes[0]).kind if item.axes else ""
     units = {s.name: (getattr(s, kind, None) or s).unit for s in item.effect.states}
-    return {s: unit_of(unit, item.effect, item.target, device) for s, unit in units.items()}
+    return {s: unit_of(unit, item.effect, item.places, device) for s, unit in units.items()}
 
 
 def _split_unit(unit: str) -> list[tuple[str, str]]:

@@ -1,5 +1,6 @@
 """The symbolic equations of motion of a model, and the terms of its effects."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,12 +42,12 @@ class Equations:
         mass: mass matrix, n by n.
         bias: h(q, qd): Coriolis, centrifugal and potential terms.
         dynamics: mass times acceleration plus bias.
-        other: Q_other, process noise included.
-        applied: Q_applied; applied_noise: the same with noise on the measured force.
+        other: Q_other; applied: Q_applied; noise_force: the generalised force of the process noise.
         input_map: d applied / d force of the device itself.
         rates, initial: of the internal states.
         offset, offset_rate: q_true - q_measured and its time derivative.
-        kinetic, potential: energies, as declared, definitions put in.
+        kinetic, potential: declared energies, definitions put in; without those of a robot's
+            bodies.
         dependence: of the residual on each parameter.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
             `roles.find_compensation`; zero without one.
@@ -69,7 +70,7 @@ class Equations:
     dynamics: list[Any]
     other: list[Any]
     applied: list[Any]
-    applied_noise: list[Any]
+    noise_force: list[Any]
     input_map: list[list[Any]]
     rates: list[Any]
     initial: list[Any]
@@ -82,19 +83,32 @@ class Equations:
     delays: list[str]
 
     @property
-    def quiet_other(self) -> list[Any]:
-        """Q_other without process noise."""
-        return [sp.sympify(o, strict=True).subs(dict.fromkeys(self.w, 0)) for o in self.other]
+    def required(self) -> list[Any]:
+        """The generalised force that a motion requires, by axis."""
+        return [f - o for f, o in zip(self.dynamics, self.other, strict=True)]
+
+    @property
+    def residual(self) -> list[Any]:
+        """Q_applied less that."""
+        return [a - r for a, r in zip(self.applied, self.required, strict=True)]
 
 
 def contribution(full: Equations, bare: Equations) -> list[Any]:
     """Return the terms of the effects in ``full`` beyond the residual of ``bare``, by axis."""
-    other, bare_other = full.quiet_other, bare.quiet_other
     added = []
     for i in range(len(full.q)):
         inertia = sum(
             (m - n) * a for m, n, a in zip(full.mass[i], bare.mass[i], full.qdd, strict=True)
         )
-        force = full.applied[i] - bare.applied[i] + other[i] - bare_other[i]
+        force = full.applied[i] - bare.applied[i] + full.other[i] - bare.other[i]
         added.append(sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia, strict=True))
     return added
+
+
+def join_overlapping(sets: Iterable[set[Any]]) -> list[set[Any]]:
+    """Join sets that share an element."""
+    joined: list[set[Any]] = []
+    for one in sets:
+        touching = [s for s in joined if s & one]
+        joined = [s for s in joined if not s & one] + [one.union(*touching)]
+    return joined

@@ -208,10 +208,11 @@ def _is_bounded(value: Any) -> bool:
 def _builders() -> dict[str, Callable[..., Any]]:
     import sympy as sp
 
-    from bampipe.physics.extrema import Max, Min
+    from bampipe.physics.real_functions import Max, Min, log
 
-    same = {n: getattr(sp, n) for n in ("sin", "cos", "tan", "atan", "exp", "log", "sqrt", "tanh")}
+    same = {n: getattr(sp, n) for n in ("sin", "cos", "tan", "atan", "exp", "sqrt", "tanh")}
     return same | {
+        "log": log,
         "abs": sp.Abs,
         "min": Min,
         "max": Max,

@@ -1,12 +1,13 @@
 """Source code of the internal states of effects along a motion, and the loops that follow them."""
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import sympy as sp
 
 from bampipe.physics.codegen import SCALAR_HEADER, filling_function
-from bampipe.physics.equations import Equations
+from bampipe.physics.equations import Equations, join_overlapping
 from bampipe.physics.memory import ACCURATE, STABLE, STEPS, STIFF_STEPS, TOLERANCE
 
 _FEWEST = 3
@@ -166,13 +167,12 @@ def group_states(e: Equations) -> list[list[int]]:
 
     States of one effect share a group, which is integrated in one loop.
     """
-    groups: list[set[int]] = []
     effects = [name.rpartition(".")[0] for name in e.z_names]
-    for rate, effect in zip(e.rates, effects, strict=True):
-        joined = {k for k, z in enumerate(e.z) if z in rate.free_symbols or effects[k] == effect}
-        apart = [g for g in groups if not g & joined]
-        groups = [*apart, joined.union(*(g for g in groups if g & joined))]
-    return sorted(sorted(g) for g in groups)
+    joined = (
+        {k for k, z in enumerate(e.z) if z in rate.free_symbols or effects[k] == effect}
+        for rate, effect in zip(e.rates, effects, strict=True)
+    )
+    return sorted(sorted(group) for group in join_overlapping(joined))
 
 
 def memory_source(e: Equations, places: Sequence[int]) -> tuple[str, dict[str, list[int]]]:
@@ -195,35 +195,30 @@ def memory_source(e: Equations, places: Sequence[int]) -> tuple[str, dict[str, l
     groups = {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p}
     used_symbols = set().union(*(sp.sympify(rate, strict=True).free_symbols for rate in rates))
     uses = {g: [i for i, s in enumerate(some) if s in used_symbols] for g, some in groups.items()}
-    column_symbols = {
-        groups[g][i]: sp.Symbol(f"{g}_{k:03d}", real=True)
-        for g, numbers in uses.items()
-        for k, i in enumerate(numbers)
+    known = {g: [some[i] for i in uses[g]] for g, some in groups.items()} | {"z": z_all}
+    passed = {
+        g: [sp.Symbol(f"{g}_{k:03d}", real=True) for k in range(len(some))]
+        for g, some in known.items()
     }
-    column_symbols |= {z: sp.Symbol(f"z_{k:03d}", real=True) for k, z in enumerate(z_all)}
-    passed_symbols = {
-        g: [column_symbols[groups[g][i]] for i in numbers] for g, numbers in uses.items()
-    }
-    states = [column_symbols[z] for z in z_all]
+    numbered = dict(zip(chain(*known.values()), chain(*passed.values()), strict=True))
 
     def number_columns(expressions: Sequence[Any]) -> list[Any]:
-        return [sp.sympify(x, strict=True).xreplace(column_symbols) for x in expressions]
+        return [sp.sympify(x, strict=True).xreplace(numbered) for x in expressions]
 
     if coupled or any(slope.free_symbols & set(z_all) for slope in slopes):
-        groups_of = {**passed_symbols, "z": states}
-        rate = filling_function("memory_rate", groups_of, {"dz": number_columns(rates)}, "")
+        rate = filling_function("memory_rate", passed, {"dz": number_columns(rates)}, "")
         head = f"import numpy as np\nCOUPLED, STEPS = {coupled}, {STEPS if coupled else (1,)}\n"
         head += f"ACCURATE, STABLE = {ACCURATE}, {STABLE}\n"
         head += f"STIFF_STEPS, TOLERANCE = {STIFF_STEPS}, {TOLERANCE}\n"
         source = SCALAR_HEADER + head + rate + BETWEEN + MEMORY_LOOP
         if not coupled:
             results = {"slope": number_columns(slopes)}
-            slope = filling_function("memory_slope", groups_of, results, "")
-            source += slope + STIFF_MEMORY_LOOP
+            source += filling_function("memory_slope", passed, results, "") + STIFF_MEMORY_LOOP
         return source, uses
     rates_at_zero = [rate.subs(z, 0) for rate, z in zip(rates, z_all, strict=True)]
     columns = {"c": number_columns(rates_at_zero), "b": number_columns(slopes)}
-    terms = filling_function("memory_terms", passed_symbols, columns, "")
+    del passed["z"]
+    terms = filling_function("memory_terms", passed, columns, "")
     steady = not any(slope.free_symbols & {*e.q, *e.qd, *e.u} for slope in slopes)
     head = f"import numpy as np\nRAMP = {steady}\nFEWEST = {_FEWEST}\n"
     return SCALAR_HEADER + head + terms + BETWEEN + LINEAR_MEMORY_LOOP, uses

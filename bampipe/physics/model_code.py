@@ -70,24 +70,25 @@ def whole_code(model: Model) -> Generation:
     """Which slopes are the same everywhere, and the source of the whole mechanism's functions."""
     equations = _derive_once(model)
     slopes, places = slopes_source(equations)
-    along, here = bodies_along_motion(equations), bodies_at_state(equations)
+    names, along = bodies_along_motion(equations)
+    known, here = bodies_at_state(equations)
     lasting = enumerate(equations.dependence.lasting)
     facts = {
         "slopes": places,
         "lasting": [i for i, by_axis in lasting if by_axis is not None],
         "of_bodies": equations.dependence.of_bodies,
-        "bodies": len(along.names),
+        "bodies": len(names),
     }
     sources = {
         "slopes": slopes,
         "dynamics": dynamics_source(equations),
         **rows_sources(equations, ROWS),
     }
-    sources["residual"], title = residual_source(equations, along.names), ""
-    if along.names:
-        sources["bodies"], sources["compiled_bodies"] = along.source, here.source
-        title = generated_code.module_title("compiled_bodies", here.source)
-    return facts, sources | scalar_sources(equations, here, title)
+    sources["residual"], title = residual_source(equations, names), ""
+    if names:
+        sources["bodies"], sources["compiled_bodies"] = along, here
+        title = generated_code.module_title("compiled_bodies", here)
+    return facts, sources | scalar_sources(equations, known, title)
 
 
 def moved_first(model: Model, e: Equations, forces: list[Any]) -> list[list[int]]:

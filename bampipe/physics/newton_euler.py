@@ -10,7 +10,7 @@ Gravity enters as an acceleration of the base (Luh, Walker and Paul 1980).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -46,12 +46,26 @@ class Link:
     zero: float = 0.0
 
 
-@dataclass
-class Text:
-    """Names of intermediates and their values, in the order in which they are needed."""
+class Algebra:
+    """The algebra of the equations, here of numbers or columns of numbers."""
 
-    steps: list[tuple[Any, Any]] = field(default_factory=list)
-    _known: dict[Any, Any] = field(default_factory=dict)
+    sin: Any = staticmethod(np.sin)
+    cos: Any = staticmethod(np.cos)
+
+    def name(self, value: Any) -> Any:
+        """Keep an intermediate."""
+        return value
+
+
+class Text(Algebra):
+    """Symbols: names of intermediates and their values, in the order in which they are needed."""
+
+    def __init__(self) -> None:
+        import sympy as sp  # takes half a second, which derived code saves
+
+        self.sin, self.cos, self._symbol = sp.sin, sp.cos, sp.Symbol
+        self.steps: list[tuple[Any, Any]] = []
+        self._known: dict[Any, Any] = {}
 
     def name(self, value: Any) -> Any:
         """Return a symbol for ``value``; numbers, symbols and their negatives stay."""
@@ -60,37 +74,9 @@ class Text:
         if value.is_Mul and len(value.args) == 2 and value.args[0] == -1:
             return -self.name(-value)
         if value not in self._known:
-            import sympy as sp  # takes half a second, which derived code saves
-
-            self._known[value] = sp.Symbol(f"r_{len(self.steps)}")
+            self._known[value] = self._symbol(f"r_{len(self.steps)}")
             self.steps.append((self._known[value], value))
         return self._known[value]
-
-
-@dataclass(frozen=True)
-class Algebra:
-    """The algebra of the equations: symbols or numbers.
-
-    Attributes:
-        sin, cos: of a joint's position.
-        name: keeps an intermediate.
-    """
-
-    sin: Callable[[Any], Any]
-    cos: Callable[[Any], Any]
-    name: Callable[[Any], Any]
-
-    @classmethod
-    def symbols(cls, text: Text) -> Algebra:
-        """Symbols, every intermediate a name in ``text``."""
-        import sympy as sp
-
-        return cls(sp.sin, sp.cos, text.name)
-
-    @classmethod
-    def numbers(cls) -> Algebra:
-        """Numbers or columns of numbers."""
-        return cls(np.sin, np.cos, lambda value: value)
 
 
 @dataclass(frozen=True)
@@ -135,8 +121,7 @@ def joint_forces(
     Returns:
         Those of the same joints.
     """
-    a = algebra
-    moving = _link_motions(a, links, q, qd, qdd, gravity)
+    a, moving = algebra, _link_motions(algebra, links, q, qd, qdd, gravity)
     force, moment = [], []
     for at, (mass, *rest) in zip(moving, inertial, strict=True):
         first, inertia = (rest[0], rest[1], rest[2]), _symmetric_matrix(rest[3:])
@@ -185,7 +170,6 @@ def _extend_to_links(links: Sequence[Link], values: Sequence[Any], position: boo
 
 
 def columns(
-    algebra: Algebra,
     links: Sequence[Link],
     q: Sequence[Any],
     qd: Sequence[Any],
@@ -194,10 +178,9 @@ def columns(
 ) -> list[list[list[Any]]]:
     """Return what one of each inertial number adds to each joint's force: [joint][link][number].
 
-    Arguments as in `joint_forces`.
+    Arguments as in `joint_forces`, of numbers.
     """
-    a = algebra
-    moving = _link_motions(a, links, q, qd, qdd, gravity)
+    moving = _link_motions(Algebra(), links, q, qd, qdd, gravity)
     results: list[list[list[Any]]] = [[[0] * INERTIAL for _ in links] for _ in links]
     felt: list[dict[int, tuple[Vector, Vector]]] = []
     for i, (link, at) in enumerate(zip(links, moving, strict=True)):
@@ -205,17 +188,12 @@ def columns(
         here: dict[int, tuple[Vector, Vector]] = {}
         for j, (turn, push) in felt[link.parent].items() if link.parent >= 0 else ():
             onward = _add(push, _cross(turn, at.offset))
-            here[j] = (
-                _name_components(a, at.from_parent(turn)),
-                _name_components(a, at.from_parent(onward)),
-            )
+            here[j] = at.from_parent(turn), at.from_parent(onward)
         here[i] = (ZERO, link.axis) if link.slides else (link.axis, ZERO)
         felt.append(here)
-        by_number = _unit_wrenches(a, at)
+        by_number = _unit_wrenches(at)
         for j, (turn, push) in here.items():
-            results[j][i] = [
-                a.name(_dot(turn, moment) + _dot(push, force)) for force, moment in by_number
-            ]
+            results[j][i] = [_dot(turn, moment) + _dot(push, force) for force, moment in by_number]
     table: list[list[list[Any]]] = []
     for (first, _), *others in _list_turned_links(links):
         rows = results[first]
@@ -226,7 +204,7 @@ def columns(
     return table
 
 
-def _unit_wrenches(a: Algebra, at: _LinkMotion) -> list[tuple[Vector, Vector]]:
+def _unit_wrenches(at: _LinkMotion) -> list[tuple[Vector, Vector]]:
     """Force and moment at the joint by each inertial number of the link."""
     x, y, z = at.rate
     dx, dy, dz = at.rate_change
@@ -238,29 +216,7 @@ def _unit_wrenches(a: Algebra, at: _LinkMotion) -> list[tuple[Vector, Vector]]:
         (dz + x * y, z * z - x * x, dx - y * z), (-y * z, dy, x * y),
         (y * y - z * z, dz - x * y, dy + x * z), (y * z, -x * z, dz),
     ]  # fmt: skip
-    return results + [(ZERO, _name_components(a, moment)) for moment in moments]
-
-
-def potential_energy(
-    algebra: Algebra,
-    links: Sequence[Link],
-    inertial: Sequence[Sequence[Any]],
-    q: Sequence[Any],
-    gravity: Vector,
-) -> Any:
-    """Return the potential energy of gravity, J; zero where all moments are at the base."""
-    still = [0] * len(q)
-    moving = _link_motions(algebra, links, q, still, still, gravity)
-    heights: list[Any] = []
-    total: Any = 0
-    for link, at, (mass, *rest) in zip(links, moving, inertial, strict=True):
-        below: Vector = (
-            moving[link.parent].acceleration if link.parent >= 0 else _scale(-1, gravity)
-        )
-        height = heights[link.parent] if link.parent >= 0 else 0
-        heights.append(algebra.name(height + _dot(below, at.offset)))
-        total = total + mass * heights[-1] + _dot(at.acceleration, (rest[0], rest[1], rest[2]))
-    return algebra.name(total)
+    return results + [(ZERO, moment) for moment in moments]
 
 
 def mass_matrix(

@@ -4,12 +4,11 @@ The text is that of the compiled model, its parameters put in as numbers, in Pyt
 nothing but the mathematics that comes with the language.
 """
 
-import re
 from typing import Literal
 
 from bampipe.arrays import Array
 from bampipe.errors import InputError
-from bampipe.physics.codegen import print_portable
+from bampipe.physics.codegen import print_portable, unpack_groups
 from bampipe.physics.derivation import derive
 from bampipe.physics.model import Model
 
@@ -90,14 +89,7 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
     inputs = [symbol for symbol in e.u if symbol in block.used]
     names = [e.inputs[e.u.index(symbol)] for symbol in inputs]
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "u": inputs}
-    places = {str(s): f"{group}[{i}]" for group, some in groups.items() for i, s in enumerate(some)}
-    lines, values = (
-        [
-            re.sub(r"\b[a-z]+\d+\b", lambda found: places.get(found[0], found[0]), text)
-            for text in texts
-        ]
-        for texts in (block.lines, block.values)
-    )
+    lines, values = [*unpack_groups(groups, block.used), *block.lines], block.values
     axes = model.device.coordinates
     of = ", ".join(f"{c.name} ({c.unit})" for c in axes)
     effects, logged = (

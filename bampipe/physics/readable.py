@@ -108,13 +108,13 @@ def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
     device = model.device
     e = derive(model, named_constants=True)
     marks = [c.symbol for c in device.coordinates]
-    names: dict[Any, Any] = {constant_symbol(c): sp.Symbol(c, real=True) for c in device.constants}
+    names: dict[Any, str] = {constant_symbol(c): c for c in device.constants}
     rates, seconds = [f"{m}'" for m in marks], [f"{m}''" for m in marks]
     for symbols, texts in (
         (e.q, marks), (e.qd, rates), (e.qdd, seconds),
         (e.u, e.inputs), (e.z, e.z_names), (e.p, labels),
     ):  # fmt: skip
-        names |= {s: sp.Symbol(text, real=True) for s, text in zip(symbols, texts, strict=True)}
+        names |= zip(symbols, texts, strict=True)
     sign = sp.Function("sgn")
 
     def text(expr: Any) -> str:
@@ -126,7 +126,7 @@ def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
                 lambda f, rate=rate: isinstance(f, sp.tanh) and f.args[0].free_symbols == {rate},
                 lambda f, rate=rate: sign(rate),
             )
-        return str(_Notation().doprint(plain.xreplace(names)))
+        return notation(plain, names)
 
     lines: list[tuple[str, str]] = []
     if device.robot is not None:  # hundreds of lines, of which nobody would read one
@@ -138,7 +138,7 @@ def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
                 if j >= i and e.mass[i][j] != 0:
                     lines.append((f"M[{a},{b}] = ", text(e.mass[i][j])))
         lines += [(f"h[{a}] = ", text(h)) for a, h in zip(marks, e.bias, strict=True)]
-    for a, applied, other in zip(marks, e.applied, e.quiet_other, strict=True):
+    for a, applied, other in zip(marks, e.applied, e.other, strict=True):
         lines.append((f"Q[{a}] = ", text(applied + other)))
     lines += [(f"d {z}/dt = ", text(rate)) for z, rate in zip(e.z_names, e.rates, strict=True)]
     return {"potential": text(e.potential), "lines": lines}

@@ -301,7 +301,7 @@ class Robot(Declaration):
             Numbers, or (T,) where they differ, N.m or N.
         """
         a, b, c = (list(np.ascontiguousarray(x.T)) for x in (q, qd, qdd))
-        return columns(Algebra.numbers(), self.links, a, b, c, gravity_vector(self))
+        return columns(self.links, a, b, c, gravity_vector(self))
 
     def drawn_forces(
         self, q: Array, qd: Array, qdd: Array, gravity: Array, only: int | None = None
@@ -319,7 +319,7 @@ class Robot(Declaration):
         ]
         a, b, c = (list(np.ascontiguousarray(part.T)) for part in (q, qd, qdd))
         down = (gravity[0], gravity[1], gravity[2])
-        forces = joint_forces(Algebra.numbers(), self.links, bodies, a, b, c, down)
+        forces = joint_forces(Algebra(), self.links, bodies, a, b, c, down)
         return np.column_stack([np.broadcast_to(force, len(q)) for force in forces])
 
     @cached_property

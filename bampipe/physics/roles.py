@@ -6,21 +6,18 @@ import sympy as sp
 
 from bampipe.physics import expression
 from bampipe.physics.device import derivative
+from bampipe.physics.signals import ActingInputs
 from bampipe.physics.vocabulary import Vocabulary
 
 
-def find_compensation(
-    d: Vocabulary, potential: Any, logged: list[Any], side: list[Any]
-) -> list[Any]:
+def find_compensation(d: Vocabulary, potential: Any, inputs: ActingInputs) -> list[Any]:
     """Return the generalised force of a gravity compensator, one expression per coordinate.
 
     That is a torque of the device's own table, on a coordinate that the potential energy depends
     on, that itself depends on the pose; with the effects that name it, or a constant or definition
     that nothing but that torque uses (a compensator that lags or is mistuned).
 
-    Args:
-        potential: energy of the model; logged, side: generalised force and side load of the
-            logged inputs, by axis.
+    ``potential`` is the energy of the model.
     """
     device = d.model.device
     torque = d.table(device.torque, "torque")
@@ -38,7 +35,7 @@ def find_compensation(
         for key, tree in item.effect.expressions.items():
             place = d.axes.index(item.target_of(key))
             if balanced[place] and expression.names(tree) & own:
-                symbols = d.effect_symbols(item, logged, side)
+                symbols = d.effect_symbols(item, inputs.logged, inputs.side)
                 results[place] += d.build(tree, symbols, key, item)
     return results
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, get_args
 
 from bampipe.errors import InputError
@@ -41,7 +42,7 @@ def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
         return item.effect.kind == earlier.effect.kind
     if "dry" in item.effect.names:
         return earlier.effect.kind in ("torque", "input")
-    if item.effect.uses_pull and earlier.effect.pulls:
+    if "pull" in item.effect.terms and earlier.effect.pulls:
         return item.effect.scope == "device" or item.target == earlier.target
     if earlier.effect.acting_link not in ("lag", "saturation"):
         return False
@@ -58,34 +59,28 @@ class ActingInputs:
     """The inputs that act, as expressions of the logged ones, and the internal states between.
 
     Attributes:
+        logged, side: generalised force and side load, by axis, of the logged inputs.
         acting: by the symbol of a logged force or channel, its acting part, if that differs.
         rates, initial: of the internal states of the effects between, by symbol.
     """
 
-    def __init__(
-        self, d: Vocabulary, effects: Iterable[BoundEffect], applied: list[Any], side: list[Any]
-    ) -> None:
-        """Chain the effects of kind ``input`` among ``effects``.
-
-        Args:
-            effects: its effects, or some of them.
-            applied, side: generalised force and side load, by axis, of the logged inputs.
-        """
-        self._d = d
+    def __init__(self, d: Vocabulary, effects: Iterable[BoundEffect]) -> None:
+        """Chain the effects of kind ``input`` among ``effects``: those of the model, or some."""
+        self._d, device = d, d.model.device
+        self.logged = d.table(device.applied, "applied")
+        self.side = d.table(device.side_load, "side_load")
         self.acting: dict[Any, Any] = {}
         self.rates: dict[Any, Any] = {}
         self.initial: dict[Any, Any] = {}
         for item in order_of_action(e for e in effects if e.effect.kind == "input"):
-            self._add(item, applied, side)
+            self._add(item)
 
-    def _add(self, item: BoundEffect, applied: list[Any], side: list[Any]) -> None:
+    def _add(self, item: BoundEffect) -> None:
         d, device = self._d, self._d.model.device
         known, found = (*device.forces, *device.channels), {}
-        symbols = d.effect_symbols(item, applied, side)
+        symbols = d.effect_symbols(item, self.logged, self.side)
         for key, tree in item.effect.expressions.items():
-            place = key.partition(".")[2]
-            if not place:
-                place = item.target if item.effect.scope == "channel" else d.targeted(item)[0]
+            place = key.partition(".")[2] or item.places[0]
             for name in device.forces if place == EACH else (place,):
                 if name not in known:
                     raise InputError(f"effect {item.name!r}: device has no input {name!r}")
@@ -93,11 +88,43 @@ class ActingInputs:
                     for k in range(len(INPUT_ORDERS)):
                         symbols[derivative("f", k)] = d.channel[derivative(name, k)]
                 found[d.channel[name]] = self.put_in(d.build(tree, symbols, key, item))
-        for state in item.effect.states:
-            z = d.z[item.prefix, state.name]
-            rate, initial = d.build_state(item, state, symbols)
-            self.rates[z], self.initial[z] = self.put_in(rate), self.put_in_initial(initial)
+        for z, rate, initial in self.build_states(item, symbols):
+            self.rates[z], self.initial[z] = rate, initial
         self.acting |= found
+
+    @cached_property
+    def applied(self) -> list[Any]:
+        """Generalised force of the acting inputs, by axis."""
+        return [self.put_in(e) for e in self.logged]
+
+    @cached_property
+    def input_map(self) -> list[list[Any]]:
+        """d logged / d force, by axis."""
+        return [[e.diff(f) for f in self._measured] for e in self.logged]
+
+    @property
+    def _measured(self) -> list[Any]:
+        return [self._d.channel[f] for f in self._d.model.device.forces]
+
+    def find_noise(self, w: Sequence[Any]) -> list[Any]:
+        """Return the generalised force of noise ``w`` on each measured force, by axis."""
+        noisy = {f: self.acting.get(f, f) + n for f, n in zip(self._measured, w, strict=False)}
+        values = [*(self.acting | noisy).items()]
+        present = [{s: v for s, v in values if s in e.free_symbols} for e in self.logged]
+        triples = zip(self.logged, present, self.applied, strict=True)
+        return [e.subs(v, simultaneous=True) - a for e, v, a in triples]
+
+    def build_states(
+        self, item: BoundEffect, symbols: Mapping[str, Any]
+    ) -> Iterator[tuple[Any, Any, Any]]:
+        """Yield the internal states of ``item``, each with its rate and its initial value."""
+        for state in item.effect.states:
+            what = f"states.{state.name}"
+            rate = self._d.build(state.rate, symbols, f"{what}.rate", item)
+            initial = self._d.build(state.initial, symbols, f"{what}.initial", item)
+            # At the start, states between log and mechanism have their initial values.
+            initial = self.put_in(initial).subs(self.initial, simultaneous=True)
+            yield self._d.z[item.prefix, state.name], self.put_in(rate), initial
 
     def put_in(self, expr: Any) -> Any:
         """Return ``expr`` with the acting parts of logged inputs and derivatives in their place.
@@ -117,7 +144,3 @@ class ActingInputs:
                     raise InputError(f"the time derivative {k} of {force!r} is not known")
                 values[d.channel[derivative(force, k)]] = value
         return expr.subs(values, simultaneous=True) if values else expr
-
-    def put_in_initial(self, expr: Any) -> Any:
-        """Return the same for an initial value, with initial states between log and mechanism."""
-        return self.put_in(expr).subs(self.initial, simultaneous=True)

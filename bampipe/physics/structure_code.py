@@ -8,7 +8,7 @@ import sympy as sp
 
 from bampipe.physics.codegen import ARRAY_HEADER, function_source
 from bampipe.physics.derivation import derive
-from bampipe.physics.equations import Equations
+from bampipe.physics.equations import Equations, join_overlapping
 from bampipe.physics.model import Model
 from bampipe.physics.readable import notation
 from bampipe.physics.vocabulary import constant_symbol
@@ -34,7 +34,7 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
     # Without motion there is no force. For a robot's bodies, see `base_parameters`.
     for expr in (e.kinetic, e.potential) if model.device.robot is None else ():
         factors += _collect_factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
-    for expr in (*e.applied, *e.quiet_other, *e.rates, *e.offset):
+    for expr in (*e.applied, *e.other, *e.rates, *e.offset):
         factors += _collect_factors(expr, motion, set(names))
     known_symbols: set[Any] = set()
     while True:
@@ -52,7 +52,7 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
     ]
     pivots: list[str] = [name for name, *_ in numbers]
     groups = []
-    for members in _join_overlapping([f.free_symbols for f in open_factors]):
+    for members in join_overlapping([f.free_symbols for f in open_factors]):
         own = [f for f in open_factors if f.free_symbols <= members]
         ordered = [name for symbol, name in names.items() if symbol in members]
         groups.append([ordered, [notation(f, names) for f in own]])
@@ -130,25 +130,11 @@ def _select_distinct(factors: Sequence[Any]) -> list[Any]:
     return terms_kept
 
 
-def _join_overlapping(sets: Sequence[set[Any]]) -> list[set[Any]]:
-    """Join sets that share an element."""
-    joined: list[set[Any]] = []
-    for one in map(set, sets):
-        touching = [s for s in joined if s & one]
-        joined = [s for s in joined if not s & one] + [one.union(*touching)]
-    return joined
-
-
 def _print_slopes(model: Model, e: Equations, pivots: Sequence[str]) -> str:
     """Source of the slopes of the residual by the constants ``pivots``, axis by axis."""
     numbers: Mapping[Any, Any] = {
         constant_symbol(name): sp.Float(c.value) for name, c in model.device.constants.items()
     }
-    # Sympy cannot tell that a logarithm is real, and gives |x| the slope of a complex number.
-    residual = [
-        (a + o - f).replace(sp.Abs, lambda x: sp.Max(x, -x))
-        for a, o, f in zip(e.applied, e.quiet_other, e.dynamics, strict=True)
-    ]
-    slopes = [sp.diff(r, constant_symbol(n)).subs(numbers) for r in residual for n in pivots]
+    slopes = [sp.diff(r, constant_symbol(n)).subs(numbers) for r in e.residual for n in pivots]
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
     return function_source("slopes", groups, slopes, e.steps)

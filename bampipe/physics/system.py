@@ -25,6 +25,11 @@ _TOGETHER = 1024
 """Samples whose slopes by a robot's bodies are computed at once, to fit the processor's cache."""
 
 
+def _compiled(name: str) -> cached_property[Callable[..., None]]:
+    """The compiled function ``name`` of a system, in the module of that name."""
+    return cached_property(lambda system: getattr(system._whole.module(name), name))
+
+
 class System:
     """Generated functions of one model. Made by `compile_model`.
 
@@ -186,32 +191,18 @@ class System:
     def _dynamics(self) -> ModuleType:
         return self._whole.module("dynamics")
 
-    @cached_property
-    def _residual(self) -> Callable[..., None]:
-        return self._whole.module("residual").residual
+    derivative = _compiled("derivative")
+    """f(x, u, p, w, dx): numba-compiled state derivative (eq 14)."""
+    measure = _compiled("measure")
+    """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
+    derivative_rows = _compiled("derivative_rows")
+    """f(count, x, u, p, w, dx): `derivative` of many states at once, in vector registers.
 
-    @cached_property
-    def derivative(self) -> Callable[..., None]:
-        """f(x, u, p, w, dx): numba-compiled state derivative (eq 14)."""
-        return self._whole.module("derivative").derivative
-
-    @cached_property
-    def measure(self) -> Callable[..., None]:
-        """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
-        return self._whole.module("measure").measure
-
-    @cached_property
-    def derivative_rows(self) -> Callable[..., None]:
-        """f(count, x, u, p, w, dx): `derivative` of many states at once, in vector registers.
-
-        Quantity i of row r is at ``[i*ROWS + r]``; equal to `derivative` but for rounding.
-        """
-        return self._whole.module("derivative_rows").derivative_rows
-
-    @cached_property
-    def measure_rows(self) -> Callable[..., None]:
-        """h(count, x, u, p, y): `measure` of many states at once; see `derivative_rows`."""
-        return self._whole.module("measure_rows").measure_rows
+    Quantity i of row r is at ``[i*ROWS + r]``; equal to `derivative` but for rounding.
+    """
+    measure_rows = _compiled("measure_rows")
+    """h(count, x, u, p, y): `measure` of many states at once; see `derivative_rows`."""
+    _residual = _compiled("residual")
 
     def encoder_readings(self, x: Array, u: Array, p: Array) -> Array:
         """Return encoder readings of states ``x`` (T, n_x): positions, then rates, (T, 2 n_q).
@@ -222,19 +213,8 @@ class System:
         n = len(self.coordinates)
         if not self.moves_sensors:
             return x[:, : 2 * n].copy()
-        from bampipe.model_functions import ROWS
-
-        results = np.empty((len(x), 2 * n))
-        parameters = np.repeat(p, ROWS)
-        for first in range(0, len(x), ROWS):
-            part = slice(first, min(first + ROWS, len(x)))
-            count = part.stop - first
-            states, inputs = (np.zeros((columns.shape[1], ROWS)) for columns in (x, u))
-            states[:, :count], inputs[:, :count] = x[part].T, u[part].T
-            y = np.zeros(2 * n * ROWS)
-            self.measure_rows(count, states.ravel(), inputs.ravel(), parameters, y)
-            results[part] = y.reshape(-1, ROWS)[:, :count].T
-        return results
+        q, qd = x[:, :n].T, x[:, n : 2 * n].T
+        return stack_columns(self._dynamics.readings(q, qd, u.T, p), len(x))
 
     def offset(self, q: Array, u: Array, p: Array) -> Array:
         """Return true minus measured position, (T, n_q), rad or m.
@@ -393,11 +373,6 @@ class System:
         """Mass matrix (eq 13), (T, n_q, n_q), kg m2, kg m, kg."""
         n = len(self.coordinates)
         return stack_columns(self._dynamics.mass_matrix(q.T, p), len(q)).reshape(len(q), n, n)
-
-    def energy(self, q: Array, qd: Array, p: Array) -> tuple[Array, Array]:
-        """Kinetic and potential energy, each (T,), J."""
-        both = stack_columns(self._dynamics.energy(q.T, qd.T, p), len(q))
-        return both[:, 0], both[:, 1]
 
     def compensation(self, q: Array, qd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force of the gravity compensator (eq 16), (T, n_q), N.m or N.

@@ -9,7 +9,7 @@ import sympy as sp
 from bampipe.errors import InputError
 from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
-from bampipe.physics.effect import PAIR, BoundEffect, State, force_pairs
+from bampipe.physics.effect import PAIR, BoundEffect
 from bampipe.physics.model import Model
 from bampipe.physics.time_limit import OutOfTime
 
@@ -196,7 +196,7 @@ class Vocabulary:
                 middle = sum(device.limits.get(axis, (0.0, 0.0))) / 2.0
                 symbols[f"middle_{letter}"] = sp.Float(middle)
         elif item.effect.scope in ("force_component", "force_pair"):
-            for letter, force in zip("fg", self.targeted(item), strict=False):
+            for letter, force in zip("fg", item.places, strict=False):
                 for k in range(len(INPUT_ORDERS)):
                     symbols[derivative(letter, k)] = self.channel[derivative(force, k)]
         elif item.effect.scope == "channel":
@@ -205,18 +205,3 @@ class Vocabulary:
         for p in item.parameters:
             symbols[p.name.removeprefix(f"{item.prefix}.")] = self.p[p.name]
         return symbols
-
-    def targeted(self, item: BoundEffect) -> tuple[str, ...]:
-        """Force channels of a force effect: its own, and for a pair the one that leaks into it."""
-        forces = self.model.device.forces
-        if item.effect.scope == "force_component":
-            return (forces[self.model.device.components.index(item.target)],)
-        return force_pairs(self.model.device)[item.target]
-
-    def build_state(self, item: BoundEffect, state: State, symbols: Symbols) -> tuple[Any, Any]:
-        """Rate and initial value of an internal state of ``item``."""
-        what = f"states.{state.name}"
-        return (
-            self.build(state.rate, symbols, f"{what}.rate", item),
-            self.build(state.initial, symbols, f"{what}.initial", item),
-        )

@@ -171,7 +171,7 @@ def _draw_base_values(device: Device, rng: np.random.Generator) -> dict[str, flo
     for p in device.parameters:
         nominal = p.prior if p.typical is None else p.typical
         factor = 1.0 + spread.get(p.name.partition(".")[0], 0.003) * float(rng.uniform(-1.0, 1.0))
-        values[p.name] = p.prior if p.fixed else _clip(nominal * factor, p.lower, p.upper)
+        values[p.name] = p.prior if p.fixed else float(np.clip(nominal * factor, p.lower, p.upper))
     return values
 
 
@@ -188,9 +188,5 @@ def _draw_effect_values(
             wanted = sign * strength * usual
         else:
             wanted = usual * (1.0 + 0.2 * draw)
-        values[p.name] = p.prior if p.fixed else _clip(wanted, p.lower, p.upper)
+        values[p.name] = p.prior if p.fixed else float(np.clip(wanted, p.lower, p.upper))
     return values
-
-
-def _clip(value: float, lower: float, upper: float) -> float:
-    return min(max(value, lower), upper)

@@ -1,14 +1,10 @@
 """What the smoothed sign of a velocity adds to intervals, on an arm that truly stands still."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 from independent_runs import record_trials
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.estimate.unscented import FilterSettings
 from bampipe.files import write_text
 from bampipe.identification.filter_estimate import _Widths
 from bampipe.identification.sensor_noise import choose_tuning_trials
@@ -39,9 +35,9 @@ def test_widths_change_and_nothing_else() -> None:
 
 def widths(likely: dict[tuple[float, int], float]) -> _Widths:
     """With log likelihoods by width and parts of the step; others must not be asked for."""
-    found: Any = SimpleNamespace(settings=FilterSettings(*4 * [np.ones(1)]))
-    filtered = {key: (value, np.array([key[0]])) for key, value in likely.items()}
-    return _Widths(found, None, 1.0, None, None, 1e-3, filtered)  # type: ignore[arg-type]
+    compared = _Widths.__new__(_Widths)
+    compared.filtered = {key: (value, np.array([key[0]])) for key, value in likely.items()}
+    return compared
 
 
 def test_the_likeliest_width_is_chosen_with_the_longest_step_that_serves() -> None:

@@ -4,8 +4,10 @@ import copy
 from types import SimpleNamespace
 
 import numpy as np
+import sympy as sp
 
 from bampipe.physics import registry
+from bampipe.physics.derivation import derive
 from bampipe.trials.motion import Motion
 
 
@@ -30,6 +32,13 @@ def run_as_python(system, *modules):
             text = "\n".join(lines).replace("from bampipe.compiled import njit, part", plain)
             exec(text, scope)
     return SimpleNamespace(**scope)
+
+
+def energies(system, q, qd, p):
+    """Kinetic and potential energy as declared, each (T,), J."""
+    e = derive(system.model)
+    both = sp.lambdify([e.q, e.qd, e.p], [e.kinetic, e.potential])(q.T, qd.T, p)
+    return [np.broadcast_to(energy, len(q)) for energy in both]
 
 
 def random_motion(device, count, seed, speed=1.0):

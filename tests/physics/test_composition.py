@@ -33,7 +33,7 @@ def kind_of(name):
     e = registry.effect(name.partition(":")[0])
     by_load = bool(e.terms & {"applied", "load", "side"})
     way = (e.kind, e.scope, e.acting_link, bool(e.states))
-    return (*way, "dry" in e.names, e.uses_weight, e.uses_pull, e.pulls, by_load)
+    return (*way, "dry" in e.names, e.uses_weight, "pull" in e.terms, e.pulls, by_load)
 
 
 # Of the arm, what meets on one reading and one encoder; of the others, everything.

@@ -3,7 +3,7 @@
 import bam_oracle as oracle
 import numpy as np
 import pytest
-from motions import conservative_bam, random_motion, typical_parameters
+from motions import conservative_bam, energies, random_motion, typical_parameters
 from scipy.integrate import solve_ivp
 
 from bampipe.physics import Model, compile_model, registry
@@ -50,7 +50,7 @@ def test_energy_is_conserved_without_friction(effects):
     system = compile_model(Model(device, ("rubber_band", *effects), (RUBBER,)))
     p = typical_parameters(system)
     _, x = fly(system, np.array([0.2, 0.4, 1.0, 1.5, -0.8, 0.3]), p)
-    kinetic, potential = system.energy(x[:, :3], x[:, 3:], p)
+    kinetic, potential = energies(system, x[:, :3], x[:, 3:], p)
     total = kinetic + potential
     assert np.ptp(kinetic) > 1.0
     assert np.abs(total - total[0]).max() / kinetic.max() < 1e-8
@@ -68,11 +68,11 @@ def test_energy_changes_by_the_work_of_hand_compensator_friction_and_brakes():
         rate = np.empty(6)
         x = np.concatenate([a, b])
         system.derivative(x, inputs, p, np.zeros(4), rate)
-        energies = []
+        around = []
         for sign in (1.0, -1.0):
             y = (x + sign * step * rate)[None]
-            energies.append(sum(bare.energy(y[:, :3], y[:, 3:], p[-1:]))[0])
-        change = (energies[0] - energies[1]) / (2 * step)
+            around.append(sum(energies(bare, y[:, :3], y[:, 3:], p[-1:]))[0])
+        change = (around[0] - around[1]) / (2 * step)
         sign = np.tanh(b / [1e-3, 1e-3, 2.5e-4])
         torque = oracle.user_torque(a, inputs[:3]) - p[:6:2] * b - (p[1:6:2] + inputs[3:]) * sign
         torque[1] += oracle.compensator(a)

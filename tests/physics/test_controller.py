@@ -44,7 +44,7 @@ def test_a_loop_with_an_integral_part_and_a_law_of_the_wrong_unit():
     )
     assert check_device(device) == []
     law = compile_law(device)
-    assert law.states == ("wound",) and law.limits == ((-1.0, 0.4),)
+    assert law.limits == ((-1.0, 0.4),)
     out = np.empty(2)
     law.command(np.array([0.1, 0.5]), np.array([0.3, 10.0, 7.0, 0.0]), np.array([0.2]), out)
     assert out == pytest.approx([10.0 * 0.2 + 7.0 * 0.2, 0.2])

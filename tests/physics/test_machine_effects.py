@@ -264,7 +264,7 @@ def test_units_follow_the_channel(unit, own, result):
     content = dict(registry.device("slider").declaration)
     content["inputs"] = {**content["inputs"], "force_unit": own}
     device = registry.device_from(content)
-    assert unit_of(unit, registry.effect("force_bias"), "motor", device) == result
+    assert unit_of(unit, registry.effect("force_bias"), ("motor",), device) == result
 
 
 def test_a_flexible_load_is_rigid_below_its_frequency_and_left_behind_above_it():

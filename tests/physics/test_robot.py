@@ -115,10 +115,6 @@ def test_every_function_equals_that_of_pinocchio(joints: int) -> None:
         column = reference(pin.rnea, q, at_rest, unit) - gravity
         assert np.abs(system.mass_matrix(q, p)[:, :, j] - column).max() < 1e-10
 
-    kinetic, potential = system.energy(q, qd, p)
-    assert np.abs(kinetic - reference(pin.computeKineticEnergy, q, qd)).max() < 1e-10
-    assert np.abs(potential - reference(pin.computePotentialEnergy, q)).max() < 1e-10
-
     torque = np.random.default_rng(2).normal(size=q.shape)
     expected = reference(pin.aba, q, qd, torque)
     rate, noise = np.empty(2 * joints), np.zeros(len(system.noise))

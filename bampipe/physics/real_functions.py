@@ -1,8 +1,8 @@
-"""Minimum and maximum that are compared as numbers only, not as expressions.
+"""Functions of real numbers, where sympy's own are slow or allow for complex ones.
 
-Whenever an expression is rebuilt, sympy's own ask of every pair of arguments whether one is always
-the larger, which takes about half the time of deriving the equations of an effect with internal
-states.
+Whenever an expression is rebuilt, sympy's minimum and maximum ask of every pair of arguments
+whether one is always the larger, which takes about half the time of deriving the equations of an
+effect with internal states. Those here compare numbers only.
 """
 
 from collections.abc import Iterable
@@ -29,3 +29,13 @@ class Max(_ComparesNumbers, sp.Max):  # type: ignore[misc]
 
 class Min(_ComparesNumbers, sp.Min):  # type: ignore[misc]
     """The smallest of its arguments."""
+
+
+class log(sp.log):  # type: ignore[misc]
+    """The natural logarithm, real wherever a model can be computed.
+
+    Of sympy's own, a modulus has the slope of that of a complex number.
+    """
+
+    def _eval_is_extended_real(self) -> bool:
+        return True
