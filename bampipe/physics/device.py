@@ -36,9 +36,8 @@ class Coordinate(NamedDeclaration):
     """One generalised coordinate; its name is used in expressions and column names."""
 
     kind: Literal["rotary", "linear"] = Field(description='"rotary" (rad, N.m) or "linear" (m, N)')
-    given_symbol: Text | None = Field(
-        default=None, alias="symbol", description="Symbol in printed equations"
-    )
+    given_symbol: Text | None = Field(default=None, alias="symbol")
+    """Symbol in printed equations"""
     given_sign_width: Annotated[float, Field(gt=0, lt=1000)] | None = Field(
         default=None,
         alias="sign_width",
@@ -79,37 +78,28 @@ class Constant(Declaration):
 class Energy(Declaration):
     """The energies of a device, J; beside those of its rigid bodies where it is a robot."""
 
-    kinetic: Expression = Field(
-        default="0", validate_default=True, description="Kinetic energy, J: quadratic in the rates"
-    )
-    potential: Expression = Field(
-        default="0", validate_default=True, description="Potential energy, J; 0 where left out"
-    )
+    kinetic: Expression = Field(default="0", validate_default=True)
+    """Kinetic energy, J: quadratic in the rates"""
+    potential: Expression = Field(default="0", validate_default=True)
+    """Potential energy, J; 0 where left out"""
 
 
 class Inputs(Declaration):
     """The measured channels that drive a device."""
 
-    force: Several[Name] = Field(
-        default=(), description="Channels that drive it: force_<component>, or any name"
-    )
+    force: Several[Name] = ()
+    """Channels that drive it: force_<component>, or any name"""
     force_unit: str = Field(default="N", description="Their unit, coherent SI")
-    drive: bool = Field(
-        default=False,
-        description="Whether they come from a motor rather than a force sensor: effects of"
-        " motors are then candidates",
-    )
-    prescribed: bool = Field(
-        default=False,
-        description="Whether a machine prescribes the motion, from which the force follows:"
-        " replicates keep the motion as measured",
-    )
-    brakes: dict[Name, Name] = Field(
-        default={}, description="Channel of the commanded brake, by coordinate"
-    )
-    channels: dict[Name, str] = Field(
-        default={}, description="Other channels that its expressions use, with their units"
-    )
+    drive: bool = False
+    """Whether they come from a motor rather than a force sensor: effects of motors are then
+    candidates"""
+    prescribed: bool = False
+    """Whether a machine prescribes the motion, from which the force follows: replicates keep the
+    motion as measured"""
+    brakes: dict[Name, Name] = Field(default={})
+    """Channel of the commanded brake, by coordinate"""
+    channels: dict[Name, str] = Field(default={})
+    """Other channels that its expressions use, with their units"""
 
 
 class ProcessNoise(Declaration):
@@ -134,9 +124,8 @@ class Limits(Declaration):
     upper: PhysicalNumber = Field(description="Largest position, rad or m")
     speed: Positive | None = Field(default=None, description="Highest speed, rad/s or m/s")
     acceleration: Positive | None = Field(default=None, description="Highest, rad/s2 or m/s2")
-    effort: Positive | None = Field(
-        default=None, description="Largest that its drive may give, N.m or N"
-    )
+    effort: Positive | None = None
+    """Largest that its drive may give, N.m or N"""
 
     def cross_faults(self) -> Iterator[InputError]:
         if not self.lower < self.upper:
@@ -147,11 +136,8 @@ class Integral(Declaration):
     """One state of a controller, such as the integral of its error; kept within its limits."""
 
     unit: str = Field(description="Coherent SI")
-    rate: Expression = Field(
-        description=(
-            "Its rate of change, in the quantities that a command may use; its unit per second"
-        )
-    )
+    rate: Expression
+    """Its rate of change, in the quantities that a command may use; its unit per second"""
     lower: float = Field(default=-math.inf, allow_inf_nan=True, description="Where it stops")
     upper: float = Field(default=math.inf, allow_inf_nan=True, description="Where it stops")
 
@@ -164,16 +150,13 @@ class Integral(Declaration):
 class Controller(Declaration):
     """A control law as its device file declares it."""
 
-    channels: dict[Name, str] = Field(
-        default={}, description="Recorded references and gains, name = unit"
-    )
+    channels: dict[Name, str] = Field(default={})
+    """Recorded references and gains, name = unit"""
     rate_hz: float = Field(default=0.0, ge=0, le=1e6, description="How often it acts; 0 if unknown")
-    states: dict[Name, Integral] = Field(
-        default={}, description="Its states, such as the integral of its error"
-    )
-    command: dict[Name, Expression] = Field(
-        description="The command, by force channel, from measured motion, channels and constants"
-    )
+    states: dict[Name, Integral] = Field(default={})
+    """Its states, such as the integral of its error"""
+    command: dict[Name, Expression]
+    """The command, by force channel, from measured motion, channels and constants"""
     source: str = Field(default="", description="Source of the law")
 
 
@@ -213,53 +196,35 @@ class Device(DeclaredFile):
     coordinates: Annotated[tuple[Coordinate, ...], ByName(Name, least=1)] = Field(
         default=(), description="One table per coordinate; for a robot, its joints by default"
     )
-    constants: dict[Name, Constant] = Field(
-        default={}, description="Numbers from drawings and data sheets"
-    )
-    definitions: dict[Name, Expression] = Field(
-        default={}, description="Named expressions, in order; each may use those before it"
-    )
-    energy: Energy | None = Field(
-        default=None, description="Its energies; beside [robot], added to those of its bodies"
-    )
-    robot: Robot | None = Field(
-        default=None, description="Rigid bodies on joints, in place of [energy]"
-    )
-    torque: dict[Name, Expression] = Field(
-        default={},
-        description="Per coordinate: generalised force beside friction, brakes and the input",
-    )
-    inputs: Inputs = Field(
-        default=Inputs(), description="Its inputs; for a robot, one torque per joint or motor"
-    )
-    applied: dict[Name, Expression] = Field(
-        default={},
-        min_length=1,
-        description="Per coordinate: generalised force of the channels; for a robot, by its motors",
-    )
-    side_load: dict[Name, Expression] = Field(
-        default={}, description="Per coordinate: load across the motion"
-    )
-    process_noise: dict[Name, ProcessNoise] = Field(
-        default={}, description="Further process noise of the filter"
-    )
-    friction: dict[Name, Friction] = Field(
-        default={}, description="Per coordinate: viscous and coulomb"
-    )
+    constants: dict[Name, Constant] = Field(default={})
+    """Numbers from drawings and data sheets"""
+    definitions: dict[Name, Expression] = Field(default={})
+    """Named expressions, in order; each may use those before it"""
+    energy: Energy | None = None
+    """Its energies; beside [robot], added to those of its bodies"""
+    robot: Robot | None = None
+    """Rigid bodies on joints, in place of [energy]"""
+    torque: dict[Name, Expression] = Field(default={})
+    """Per coordinate: generalised force beside friction, brakes and the input"""
+    inputs: Inputs = Inputs()
+    """Its inputs; for a robot, one torque per joint or motor"""
+    applied: dict[Name, Expression] = Field(default={}, min_length=1)
+    """Per coordinate: generalised force of the channels; for a robot, by its motors"""
+    side_load: dict[Name, Expression] = Field(default={})
+    """Per coordinate: load across the motion"""
+    process_noise: dict[Name, ProcessNoise] = Field(default={})
+    """Further process noise of the filter"""
+    friction: dict[Name, Friction] = Field(default={})
+    """Per coordinate: viscous and coulomb"""
     other_parameters: Annotated[tuple[Parameter, ...], ByName(Name)] = Field(
         default=(), alias="parameters", description="Other numbers to estimate"
     )
-    ranges: dict[Name, Limits] = Field(
-        default={},
-        alias="limits",
-        description="Range that the simulator and proposed trials stay in, by coordinate",
-    )
-    controller: Controller | None = Field(
-        default=None, description="How the force was commanded, for free runs"
-    )
-    default_effects: Distinct[Text] = Field(
-        default=(), description="Effects that its base model has"
-    )
+    ranges: dict[Name, Limits] = Field(default={}, alias="limits")
+    """Range that the simulator and proposed trials stay in, by coordinate"""
+    controller: Controller | None = None
+    """How the force was commanded, for free runs"""
+    default_effects: Distinct[Text] = ()
+    """Effects that its base model has"""
 
     @property
     def kinetic(self) -> ast.expr:

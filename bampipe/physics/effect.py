@@ -72,11 +72,8 @@ class State(NamedDeclaration):
     """An internal state of an effect with memory."""
 
     rate: Expression = Field(description="Its rate of change")
-    initial: Expression = Field(
-        default="0",
-        validate_default=True,
-        description="Value at the start of a trial; 0 if left out",
-    )
+    initial: Expression = Field(default="0", validate_default=True)
+    """Value at the start of a trial; 0 if left out"""
     unit: str = Field(default="", description="Coherent SI, if it is the same on every axis")
     rotary: Unit | None = Field(default=None, description="On a rotary axis")
     linear: Unit | None = Field(default=None, description="On a linear axis")
@@ -101,70 +98,49 @@ class Effect(DeclaredFile):
         Field(description="an identifier, such as magnetic_detent"),
     ]
     summary: Text = Field(description="Meaning, in one sentence")
-    scope: Scope = Field(
-        description="axis: one coordinate; axis_pair: one and another (q_a, qd_a, q_b, qd_b), for"
-        " a robot two neighbouring joints, a nearer to the base if it acts on both;"
-        " force_component: one reading; force_pair: a reading that leaks into another; channel:"
-        " an input other than a force; device: the whole device"
-    )
-    kind: Literal["torque", "input", "energy", "measurement"] = Field(
-        description="torque: acts on the joints; input: maps the measured force to the true one;"
-        " energy: goes through Lagrange's equation; measurement: true minus measured position"
-    )
-    torque: Expressions | None = Field(
-        default=None,
-        description="Generalised force added to the joints; per axis for the scope device",
-    )
-    input: Expressions | None = Field(
-        default=None,
-        description="True force from the measured one (f, f_rate, to f_sixth; g for the other of"
-        " a pair); per channel for the scope device",
-    )
-    offset: Expressions | None = Field(
-        default=None, description="True position minus measured position"
-    )
+    scope: Scope
+    """axis: one coordinate; axis_pair: one and another (q_a, qd_a, q_b, qd_b), for a robot two
+    neighbouring joints, a nearer to the base if it acts on both; force_component: one reading;
+    force_pair: a reading that leaks into another; channel: an input other than a force; device: the
+    whole device"""
+    kind: Literal["torque", "input", "energy", "measurement"]
+    """torque: acts on the joints; input: maps the measured force to the true one; energy: goes
+    through Lagrange's equation; measurement: true minus measured position"""
+    torque: Expressions | None = None
+    """Generalised force added to the joints; per axis for the scope device"""
+    input: Expressions | None = None
+    """True force from the measured one (f, f_rate, to f_sixth; g for the other of a pair); per
+    channel for the scope device"""
+    offset: Expressions | None = None
+    """True position minus measured position"""
     kinetic: Expression | None = Field(default=None, description="Kinetic energy added, J")
     potential: Expression | None = Field(default=None, description="Potential energy added, J")
-    dissipative: bool = Field(
-        default=False,
-        description="Whether the effect dissipates energy for all parameters within their bounds",
-    )
-    drive: bool = Field(
-        default=False,
-        description="Whether it applies to motors only: offered if the device has drive = true",
-    )
-    link: Link | None = Field(
-        default=None,
-        description="Where it acts between log and mechanism: links act in this order, each on"
-        " the output of the previous one. Default: scale, or lever for a measurement; a torque"
-        " with a link is part of the drive, and of the load of the later links",
-    )
-    robot: bool | None = Field(
-        default=None,
-        description="true: offered for robots only; false: for other devices only",
-    )
-    devices: Distinct[Text] = Field(
-        default=(), description="Devices that it suits; all if left out"
-    )
-    on_request: bool = Field(
-        default=False,
-        description="Whether a diagnosis weighs it only where its setting `also` names it",
-    )
+    dissipative: bool = False
+    """Whether the effect dissipates energy for all parameters within their bounds"""
+    drive: bool = False
+    """Whether it applies to motors only: offered if the device has drive = true"""
+    link: Link | None = None
+    """Where it acts between log and mechanism: links act in this order, each on the output of the
+    previous one. Default: scale, or lever for a measurement; a torque with a link is part of the
+    drive, and of the load of the later links"""
+    robot: bool | None = None
+    """true: offered for robots only; false: for other devices only"""
+    devices: Distinct[Text] = ()
+    """Devices that it suits; all if left out"""
+    on_request: bool = False
+    """Whether a diagnosis weighs it only where its setting `also` names it"""
     looks_like: Text = Field(description="Its trace in the residual")
     on_the_machine: str = Field(default="", description="Remedy on the machine, in one sentence")
     source: Text = Field(description="Literature, with year")
-    parameters: dict[Name, EffectParameter] = Field(
-        min_length=1, description="Its parameters, by name; each for all axes, or by kind of axis"
-    )
+    parameters: dict[Name, EffectParameter] = Field(min_length=1)
+    """Its parameters, by name; each for all axes, or by kind of axis"""
     states: Annotated[tuple[State, ...], ByName(Name)] = Field(
         default=(), description="Internal states, by name, if it has memory"
     )
 
-    ahead: Ahead | None = Field(
-        default=None,
-        description="For a torque on an axis: position of the mechanism relative to its encoder,"
-        " for the gravity, Coriolis and centrifugal forces on every axis",
-    )
+    ahead: Ahead | None = None
+    """For a torque on an axis: position of the mechanism relative to its encoder, for the gravity,
+    Coriolis and centrifugal forces on every axis"""
 
     @cached_property
     def expressions(self) -> Mapping[str, ast.expr]:

@@ -33,34 +33,24 @@ class Parameter(NamedDeclaration):
     unit: str = Field(description="Coherent SI; empty for a pure number")
     prior: PhysicalNumber = Field(description="Value assumed before seeing data, in its unit")
     sd: PhysicalNumber = Field(ge=0, description="Standard deviation of that assumption")
-    lower: PhysicalNumber = Field(
-        default=-math.inf, allow_inf_nan=True, description="Physical bound"
-    )
-    upper: PhysicalNumber = Field(
-        default=math.inf, allow_inf_nan=True, description="Physical bound"
-    )
+    lower: PhysicalNumber = Field(default=-math.inf, allow_inf_nan=True)
+    """Physical bound"""
+    upper: PhysicalNumber = Field(default=math.inf, allow_inf_nan=True)
+    """Physical bound"""
     strength: bool = Field(default=False, description="The effect is absent if this is 0")
     offset: bool = Field(default=False, description="Marks a strength that adds a mere constant")
     fixed: bool = Field(default=False, description="Held at its prior, never estimated")
-    needs_pull: bool = Field(
-        default=False, description="Held at its prior on an axis that nothing pulls by its position"
-    )
-    weighed: bool = Field(
-        default=False,
-        description="Whether least squares weighs the prior like data, as for numbers of a drawing",
-    )
-    typical: PhysicalNumber | None = Field(
-        default=None,
-        description="Size at which the effect is clearly visible; strength 1 of the simulator",
-    )
-    within: Literal["travel", "upper part", "lower part", "beyond"] | None = Field(
-        default=None,
-        description="For a position on the axis: the part of the travel where the diagnosis looks;"
-        " beyond: outside of it, on either side",
-    )
-    searched: bool = Field(
-        default=True, description="Whether a diagnosis tries several values of it, not the prior"
-    )
+    needs_pull: bool = False
+    """Held at its prior on an axis that nothing pulls by its position"""
+    weighed: bool = False
+    """Whether least squares weighs the prior like data, as for numbers of a drawing"""
+    typical: PhysicalNumber | None = None
+    """Size at which the effect is clearly visible; strength 1 of the simulator"""
+    within: Literal["travel", "upper part", "lower part", "beyond"] | None = None
+    """For a position on the axis: the part of the travel where the diagnosis looks; beyond: outside
+    of it, on either side"""
+    searched: bool = True
+    """Whether a diagnosis tries several values of it, not the prior"""
     description: str = Field(default="", description="Meaning, in a few words")
 
     def cross_faults(self) -> Iterator[InputError]:

@@ -55,23 +55,18 @@ class Joint(NamedDeclaration):
 
     kind: Literal["revolute", "prismatic"] = Field(description="Turns about z, or slides along it")
     after: str = Field(default="", description="The joint before it; empty: the base")
-    position: Triple = Field(
-        default=(0.0, 0.0, 0.0), description="Of the joint in the frame of the link before, m"
-    )
-    rotation: Triple = Field(
-        default=(0.0, 0.0, 0.0),
-        description="Of its frame in that of the link before: roll, pitch and yaw about fixed"
-        " axes, rad",
-    )
+    position: Triple = (0.0, 0.0, 0.0)
+    """Of the joint in the frame of the link before, m"""
+    rotation: Triple = (0.0, 0.0, 0.0)
+    """Of its frame in that of the link before: roll, pitch and yaw about fixed axes, rad"""
     axis: Triple = Field(default=(0.0, 0.0, 1.0), description="Of the motion, in its own frame")
     follows: str = Field(default="", description="The joint that it follows; empty: none")
     ratio: Number = Field(default=1.0, description="Its motion for one of the joint it follows")
     zero: Number = Field(default=0.0, description="Its position where that is at zero, rad or m")
     mass: Number = Field(default=0.0, description="Of the body behind it, kg, as drawn")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="Its centre of mass, m")
-    inertia: Sextuple = Field(
-        default=(0.0,) * 6, description="xx, xy, xz, yy, yz, zz about the centre of mass, kg.m2"
-    )
+    inertia: Sextuple = (0.0,) * 6
+    """xx, xy, xz, yy, yz, zz about the centre of mass, kg.m2"""
     effort: NotNegative = Field(default=0.0, description="Largest, N.m or N; 0: not known")
     velocity: NotNegative = Field(default=0.0, description="Largest, rad/s or m/s; 0: not known")
 
@@ -138,15 +133,12 @@ class Joint(NamedDeclaration):
 class Motor(Declaration):
     """A motor and the joints that turn it."""
 
-    turns: dict[Name, Number] = Field(
-        min_length=1, description="Turns of the motor for one of each joint, rad/rad or rad/m"
-    )
+    turns: dict[Name, Number] = Field(min_length=1)
+    """Turns of the motor for one of each joint, rad/rad or rad/m"""
     rotor_inertia: Positive | None = Field(default=None, description="At the motor, kg.m2")
     torque_constant: Number | None = Field(default=None, description="For a logged current, N.m/A")
-    torque_constant_sd: Positive | None = Field(
-        default=None,
-        description=("Its standard uncertainty; the constant is estimated if this is given"),
-    )
+    torque_constant_sd: Positive | None = None
+    """Its standard uncertainty; the constant is estimated if this is given"""
 
 
 class Row(NamedDeclaration):
@@ -156,14 +148,12 @@ class Row(NamedDeclaration):
     a: Number = Field(default=0.0, description="Along its own x, m")
     alpha: Number = Field(default=0.0, description="About its own x, rad")
     offset: Number = Field(default=0.0, description="Angle about z where the position is 0, rad")
-    kind: Literal["revolute", "prismatic"] = Field(
-        default="revolute", description="Turns about z of the row before, or slides along it"
-    )
+    kind: Literal["revolute", "prismatic"] = "revolute"
+    """Turns about z of the row before, or slides along it"""
     mass: Number = Field(default=0.0, description="Of the body behind it, kg")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of this row, m")
-    inertia: Sextuple = Field(
-        default=(0.0,) * 6, description="As of a joint's body, in the frame of this row"
-    )
+    inertia: Sextuple = (0.0,) * 6
+    """As of a joint's body, in the frame of this row"""
 
 
 class Payload(Declaration):
@@ -177,23 +167,19 @@ class Payload(Declaration):
 class Robot(Declaration):
     """Rigid bodies on joints; energies in [energy] are added."""
 
-    urdf: Text | None = Field(
-        default=None, description="URDF or MJCF file beside this one that the joints are read from"
-    )
+    urdf: Text | None = None
+    """URDF or MJCF file beside this one that the joints are read from"""
     base: str = Field(default="", description="Link that stands still; the URDF's root by default")
     tip: str = Field(default="", description="Last link of the chain; the URDF's only end")
     dh: Annotated[tuple[Row, ...], ByName(Name)] = Field(
         default=(), description="One table per joint, in place of a URDF"
     )
     payload: Payload | None = Field(default=None, description="A body held by the last link")
-    motors: dict[Name, Motor] = Field(
-        default={},
-        description="One table per motor; otherwise a drive at each joint whose torque is logged",
-    )
+    motors: dict[Name, Motor] = Field(default={})
+    """One table per motor; otherwise a drive at each joint whose torque is logged"""
     gravity: Triple = Field(default=(0.0, 0.0, -9.81), description="m/s2, in the base's frame")
-    uncertainty: Positive = Field(
-        default=0.3, description="Relative standard uncertainty of the drawn inertial numbers"
-    )
+    uncertainty: Positive = 0.3
+    """Relative standard uncertainty of the drawn inertial numbers"""
     joints: Annotated[tuple[Joint, ...], ByName(Name)] = Field(
         default=(), description="One table per joint, parents first; read from the URDF if given"
     )
