@@ -159,7 +159,12 @@ def select_effects(
             moved, kept = None, dict[tuple[str, ...], float]()
             last |= number >= _MOST_ROUNDS - 1
             if not last:
-                better = [k for c, k in sorted(pool.values()) if c < none - _LEAST_GAIN]
+                # The bias of the present replicates may hide an effect that only its prior rejects.
+                better = [
+                    keys
+                    for cost, keys in sorted(pool.values())
+                    if keys and cost < none + max(search.penalty_of(keys), -_LEAST_GAIN)
+                ]
                 better += _without_weakest(search, recipe.effects)
                 tell = partial(progress, 0.15 + 0.1 * number)
                 moved, kept = _fit_better(session, search, current, better, fits, tell)
