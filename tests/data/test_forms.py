@@ -264,6 +264,7 @@ def test_counters_wrap_at_any_width_and_go_on():
         ("t [s],q [deg],torque [%]", "calibration_n_per_v"),
         ("t [s],q [deg],torque_percent", 'calibration_n_per_v, N.m for one of "torque_percent"'),
         ("t [s],q [deg],load cell [kg]", "lever_m"),
+        ("t [s],belt [m/s],moment [Nm]", "[Nm] is in Nm and follows the motion, but is none"),
     ],
 )
 def test_a_unit_that_is_not_known_is_asked_for(tmp_path: Path, header: str, asked: str):
