@@ -276,7 +276,8 @@ def test_nothing_is_overwritten(tmp_path, command: Command):
         ({"a.csv": "", "b.txt": "\0"}, "", "no log that can be read"),
         ({"a.csv": "t,q,force\n" + "0,1,2\n" * 9}, "bma", "did you mean 'bam'"),
         ({"a.csv": "t,q,force\n" + "0,1,2\n" * 9}, "x.toml", "x.toml: no such file"),
-        ({"a.csv": "t,a,b\n0,1,2\n1,2,3\n"}, "", "no column looks like a position"),
+        ({"a.csv": "t,a,b\n0,1,2\n1,2,3\n"}, "", "a position; say in order"),
+        ({"a.json": '[{"a": 1, "b": 2}, {"a": 2}]'}, "", "a position; name them in the log"),
     ],
 )
 def test_folders_that_cannot_be_proposed_for(tmp_path, command: Command, files, device, said):

@@ -10,6 +10,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.chain import Branches
 from bampipe.data.device_file import complete_device, read_device_file
+from bampipe.data.readers import is_text
 from bampipe.data.survey import REFERENCE_WORDS, Survey, SurveyedColumn, words
 from bampipe.data.units import unit
 from bampipe.data.urdf import unexpanded
@@ -80,8 +81,7 @@ def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None
         # That of a robot may be three lines without a schema.
         schema = content.get("schema", _SCHEMA if "robot" in content else "")
         if schema == _SCHEMA:
-            device = registry.device_from(read_device_file(path), str(path))
-            return ChosenDevice(path.name, device)
+            return ChosenDevice(path.name, registry.device_from(read_device_file(path), str(path)))
     return _robot(folder, found) or _built_in(found)
 
 
@@ -130,8 +130,7 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
         text += f'tip = "{logged or error.stem}"  # guess: {why}\n'
         device = _complete(folder, text)
     chosen = ChosenDevice(DEVICE, device, text)
-    by_torque = any(not c.is_constant for c in found.of("force"))
-    if by_torque or not found.of("current"):
+    if any(not c.is_constant for c in found.of("force")) or not found.of("current"):
         return chosen
     return with_motors(folder, chosen, {c.name: (1.0, 1.0) for c in chosen.device.coordinates})
 
@@ -195,9 +194,8 @@ def _built_in(found: Survey) -> ChosenDevice | None:
     columns = [set(words(column.name)) for column in found.columns]
     for name in registry.device_names():
         device = registry.device(name)
-        inputs = [
-            set(words(name.removeprefix("force_"))) for name in (*device.forces, *device.channels)
-        ]
+        names = (*device.forces, *device.channels)
+        inputs = [set(words(name.removeprefix("force_"))) for name in names]
         named = all(any(said <= column for column in columns) for said in inputs)
         if named and {c.name for c in device.coordinates} <= positions:
             return ChosenDevice(name, device)
@@ -213,11 +211,13 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     found = match.found
     position = match.position("", 1, notes)
     if position is None:
+        way = "say in order what they are: bampipe init FOLDER --names t,angle_deg,..."
+        if not is_text(found.trials[0].file):
+            way = "name them in the log for what they are, as t and angle_deg"
         raise InputError(
             "no column looks like a position",
             where=f"{folder}: {found.trials[0].file}",
-            remedy="say in order what they are: bampipe init FOLDER --names t,angle_deg,...;"
-            f" columns are {', '.join(c.name for c in found.columns[:12])}",
+            remedy=f"{way}; columns are {', '.join(c.name for c in found.columns[:12])}",
         )
     linear = slides(position, found)
     driver, role = match.driver(position)
