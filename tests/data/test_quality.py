@@ -184,6 +184,9 @@ def test_a_force_that_is_zeroed_anew_sets_the_trial_aside():
     table["force_x"] = force + 0.7 * (t >= 1.2)
     with pytest.raises(InputError, match=r"jumps and stays there.*end_s and start_s = 1\.2 in"):
         cleaned(table)
+    table["force_x"] = 0.05 * np.sign(np.sin(40.0 * t)) + 0.7 * (t >= 1.2)  # by commands
+    session = session_from({**TABLE, "force": {"columns": ["force_x"], "unit": "N"}}, Path())
+    assert cleaned(table, session=session).repairs == []
 
 
 DAMAGE = st.lists(
