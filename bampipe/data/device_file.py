@@ -56,13 +56,10 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     if file is not None:
         from bampipe.data.chain import read_chain  # slow to import, and for robots alone
 
+        base, tip = (x if isinstance(x := robot.get(key), str) else "" for key in ("base", "tip"))
         payload = robot.get("payload")
-        chain = read_chain(
-            folder / file,
-            _text(robot.get("base")),
-            _text(robot.get("tip")),
-            payload if isinstance(payload, Mapping) else None,
-        )
+        payload = payload if isinstance(payload, Mapping) else None
+        chain = read_chain(folder / file, base, tip, payload)
         robot |= {"joints": dict(chain.joints), "base": chain.base, "tip": chain.tip}
         notes = list(chain.notes)
         if "gravity" not in robot:
@@ -314,7 +311,3 @@ def _positive(unit: str, prior: float, sd: float, **more: object) -> dict[str, A
 def _scale(limits: DriveLimits) -> tuple[float, float]:
     """Largest effort and velocity of a joint."""
     return max(limits.effort, 0.0) or _EFFORT, max(limits.velocity, 0.0) or _VELOCITY
-
-
-def _text(value: object) -> str:
-    return value if isinstance(value, str) else ""

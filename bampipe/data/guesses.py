@@ -42,7 +42,7 @@ _DERIVATIVE = 0.98
 """Correlation of a column with the integral of another, both without a line, to be that of it."""
 DRIVEN, _CLEAR = 0.5, 0.95
 """Share of a column that the motion must explain for it to pass as what drives it."""
-_MOVED, _CLEARLY = 0.8, 0.5
+MOVED, CLEARLY = 0.8, 0.5
 """Of two columns, the share of one that the motion of the other must explain, and how much less it
 may leave than the other way round."""
 _STEADY = 50.0
@@ -301,7 +301,7 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
         explained = [driven(seconds, matrix[:, k], matrix[:, 1 - k]).share for k in left]
         moved = int(explained[1] > explained[0])
         least, most = sorted(explained)
-        if most >= _MOVED and 1.0 - most < _CLEARLY * (1.0 - least):
+        if most >= MOVED and 1.0 - most < CLEARLY * (1.0 - least):
             found |= {names[moved]: "position", names[1 - moved]: "force"}
     return found
 

@@ -72,19 +72,14 @@ def write(folder: Path, rows: Mapping[str, Sequence[Row]]) -> dict[str, int]:
         InputError: a file cannot be written.
     """
     devices = sorted({str(row["device"]) for row in rows["sessions"]})
+    parts = {device: f"device={quote(device, safe='')}" for device in devices}
     for name, columns in TABLES.items():
-        kept = set()
-        for device in devices:
-            part = f"device={quote(device, safe='')}"
-            kept.add(part)
+        for device, part in parts.items():
             here = [row for row in rows.get(name, ()) if row["device"] == device]
-            with store.ParquetAppender(folder / name / part / "data.parquet") as file:
-                arrays = (
-                    (c, pa.array([row.get(c) for row in here], k)) for c, k in columns.items()
-                )
-                file.append(dict(arrays))
+            arrays = {c: pa.array([row.get(c) for row in here], k) for c, k in columns.items()}
+            store.write_parquet(folder / name / part / "data.parquet", arrays)
         for old in sorted((folder / name).glob("device=*")):
-            if old.name not in kept:
+            if old.name not in parts.values():
                 shutil.rmtree(old)
     return {name: len(rows.get(name, ())) for name in TABLES}
 

@@ -62,7 +62,11 @@ def join_parts(
     """
     if len(found) < 2:
         return [], []
-    said = {name: _quantities_in(name, role) for name in found}
+    in_name = {name: _words(Path(name).name) for name in found}
+    said = {
+        name: tuple(w for w in own if _AXIS.fullmatch(w) or role(w, "") not in ("", "time"))
+        for name, own in in_name.items()
+    }
     # Files of a kind have the same columns, and the same quantities or axes in their names.
     kinds = {name: (frozenset(columns), said[name]) for name, columns in found.items()}
     # Words that all files of a kind have; numbers, if there are several, tell trials apart.
@@ -111,11 +115,6 @@ def axes_of(names: Sequence[str]) -> dict[str, str]:
     bare = {_AXIS.sub("", name) for name in names}
     found = {name: match[0] for name in names if (match := _AXIS.search(name))}
     return found if len(bare) < len(names) == len(found) else {}
-
-
-def _quantities_in(name: str, role: Callable[[str, str], str]) -> tuple[str, ...]:
-    words = _words(Path(name).name)
-    return tuple(w for w in words if _AXIS.fullmatch(w) or role(w, "") not in ("", "time"))
 
 
 def _words(name: str) -> list[str]:

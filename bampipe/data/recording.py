@@ -65,7 +65,7 @@ def read_recording(
         return replace(
             raw,
             columns={called.get(bare, bare): values for bare, values in raw.columns.items()},
-            units={called[bare]: unit for bare, unit in raw.units.items() if bare in called},
+            units={called.get(bare, f"{name}:{bare}"): u for bare, u in raw.units.items()},
             since={called.get(bare, bare): first for bare, first in raw.since.items()},
         )
 

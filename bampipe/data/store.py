@@ -116,9 +116,8 @@ def _read_table(path: Path, columns: Sequence[str] | None, trial: str | None) ->
             return file.read(columns=wanted).select(wanted)
         if trial not in by_trial:
             raise InputError(f"no trial '{trial}'", where=str(path))
-        return file.read_row_groups(by_trial[trial], columns=wanted, use_threads=False).select(
-            wanted
-        )
+        groups = file.read_row_groups(by_trial[trial], columns=wanted, use_threads=False)
+        return groups.select(wanted)
 
 
 def column_names(path: Path) -> tuple[str, ...]:

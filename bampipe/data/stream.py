@@ -194,10 +194,8 @@ class SampleStream:
         shared = slice(min(lost.shape[1], values.shape[1]))
         values[:, shared][lost[:, shared]] = np.nan
         good = numeric.all(axis=1) & ~large.any(axis=1)
-        time = raw[:, 0] * layout.gain[0, 0]
-        before = np.maximum.accumulate(
-            np.concatenate([[self._last], np.where(good, time, -np.inf)])
-        )
+        time = np.where(good, raw[:, 0] * layout.gain[0, 0], -np.inf)
+        before = np.maximum.accumulate(np.append(self._last, time))
         late = good & ~(time > before[:-1])
         for at in np.flatnonzero(~good | late):
             if late[at]:

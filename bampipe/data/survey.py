@@ -13,7 +13,7 @@ import numpy as np
 from bampipe.data import readers
 from bampipe.data.guesses import describe, find_roles, is_time
 from bampipe.data.parts import axes_of, join_parts
-from bampipe.data.readers import columns_of, is_log, is_text, lerobot, objects, read_trial
+from bampipe.data.readers import columns_of, extension_of, is_log, is_text, lerobot, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
@@ -216,16 +216,12 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     if not read:
         raise logs.fault()
     columns, guessed = _by_looks(_with_commands(list(read)), folder)
-    if guessed and sound[0].file.lower().endswith(".json"):
-        # The first unit of a quantity is that of the first column which looks like it.
-        beside = objects.stated_units(folder / sound[0].file).items()
-        units = {_role(name, u): u for name, u in reversed(beside) if unit(u) is not None}
-        columns = tuple(
-            replace(c, unit=units.pop(c.role), by_looks=False)
-            if c.by_looks and c.role in units
-            else c
-            for c in columns
-        )
+    # The first unit of a quantity is that of the first column which looks like it.
+    units = {_role(x, u): u for x, u in reversed(logs.beside.items()) if unit(u) is not None}
+    columns = tuple(
+        replace(c, unit=units.pop(c.role), by_looks=False) if c.by_looks and c.role in units else c
+        for c in columns
+    )
     if dataset is not None:
         logs.remarks = [lerobot.REMARK]
     return Survey(tuple(sound), columns, (*logs.remarks, *guessed), tuple(logs.passed))
@@ -235,7 +231,8 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
 class _Logs:
     """The files of a folder while it is found out which are logs, and which belong together.
 
-    ``found``: columns and their units, by file; ``passed``, ``remarks``: see `Survey`.
+    ``found``: columns and their units, by file; ``passed``, ``remarks``: see `Survey`; ``beside``:
+    units of quantities that are no columns.
     """
 
     folder: Path
@@ -244,6 +241,7 @@ class _Logs:
     found: dict[str, dict[str, str]] = field(default_factory=dict)
     passed: list[tuple[str, str]] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    beside: dict[str, str] = field(default_factory=dict)
     scanned: int = 0
 
     def paths(self) -> list[Path]:
@@ -257,10 +255,10 @@ class _Logs:
             if path.is_file()
             and not any(part.startswith(".") for part in path.relative_to(folder).parts)
         )
-        paths = [p for p in files if p.suffix.lower() not in _OTHER_DATA and is_log(p)]
+        paths = [p for p in files if extension_of(p.name) not in _OTHER_DATA and is_log(p)]
         for path in files:
-            if path.suffix.lower() in _OTHER_DATA:
-                why = f"*{path.suffix} is not read: {_OTHER_DATA[path.suffix.lower()]}"
+            if (extension := extension_of(path.name)) in _OTHER_DATA:
+                why = f"*{extension} is not read: {_OTHER_DATA[extension]}"
                 self.passed.append((path.relative_to(folder).as_posix(), why))
         if not paths:
             others = [p.relative_to(folder).as_posix() for p in files]
@@ -332,7 +330,9 @@ class _Logs:
         if whole:
             self._leave_out(self._asked(self._with(common)), "asked for or simulated, by name")
         names = self._with(common)
-        axes = axes_of(names)
+        stated = self.found[names[0]]
+        several = [_role(column, stated[column]) for column in common].count("position") > 1
+        axes = {} if several else axes_of(names)  # of which each has all joints are trials
         if not whole or axes:
             pool = {n: self.found[n] for n in names} if axes and whole else self.found
             trials, reasons = join_parts(self.folder, pool, _role, self.dialect)
@@ -350,8 +350,7 @@ class _Logs:
                 return trials, [c for c in self._labels(trials[0]) if c in best]
             if not whole:
                 self._refuse_parted(names[0], reasons)
-        stated = self.found[names[0]]
-        if axes and [_role(column, stated[column]) for column in common].count("position") < 2:
+        if axes:
             # No joint has the inertia and friction of the next.
             axis = Counter(axes.values()).most_common(1)[0][0]
             others = [name for name in names if axes[name] != axis]
@@ -441,6 +440,9 @@ class _Logs:
         # Of several rates, that of the positions counts.
         first = sorted(ordered, key=lambda c: (c not in times, _role(c, labels[c]) != "position"))
         raw = read_recording(self.folder, trial, first, clock, self.dialect)
+        self.beside = {
+            x.rpartition(":")[2]: u for x, u in raw.units.items() if x not in raw.columns
+        }
         sound = _complete_rows(raw.columns, clock.column)
         if not (trial.parts or trial.recording or is_text(trial.file)):
             self.remarks += raw.remarks
@@ -483,7 +485,7 @@ class _Logs:
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
         times = [c for c, u in columns.items() if _role(c, u) == "time"]
-        column = (times or [next(iter(columns))])[0]
+        column = (times or sorted(columns, key=lambda name: "[:]." not in name))[0]
         raw = self._read_one(trial.file, columns, column)
         starts = starts_of(raw, column if times else "")
         if len(starts) == 1:
@@ -534,6 +536,8 @@ def _by_looks(
         return columns, []
     times = [c.values for c in columns if c.role == "time" and not c.is_constant]
     roles = find_roles({c.name: c.values for c in unnamed}, times[0] if times else None)
+    if any(c.role in DRIVERS for c in columns):
+        roles = {name: role for name, role in roles.items() if role != "force"}
     if "position" not in roles.values():
         numbered = (re.fullmatch(r"(.*:)?column_\d+", c.name) for c in columns)
         if len(unnamed) < len(columns) or not all(numbered):

@@ -94,10 +94,6 @@ class JointMotion:
             self.position @ gain.T, self.rate @ gain.T / time, self.change @ gain.T / time**2
         )
 
-    def scaled(self, factor: Array) -> JointMotion:
-        """Motion of joints that move ``factor`` (n,) times as far."""
-        return self.reread(np.diag(factor))
-
 
 def keep(values: Array, axes: Sequence[int]) -> Array:
     """Return the columns unchanged: a `Comparison.thin` that compares every sample."""
@@ -143,10 +139,6 @@ class Comparison:
         motions = [m.reread(gain, time) for m in self.motions]
         return replace(self, motions=motions, _required={})
 
-    def driven(self, gain: Array) -> Comparison:
-        """The comparison with drives that are ``gain``, (n, n), times these."""
-        return replace(self, drives=self.drives @ gain.T)
-
     def _rows(self, values: Array, k: int) -> Array:
         """Samples of ``values``, (K, ...), that are compared on joint ``k``."""
         return values if self.used is None else values[self.used[:, k]]
@@ -160,7 +152,7 @@ class Comparison:
         """Drives (4, K, n) required without gravity, and by 1 m/s2 along each axis of the base."""
         n, found = len(self.ratio), []
         for motion in self.motions:
-            moved = motion.scaled(mounting.direction)
+            moved = motion.reread(np.diag(mounting.direction))
             still = np.zeros((3 * len(moved.rate), n))
             q = np.tile(moved.position + mounting.zero, (4, 1))
             qd, qdd = (np.concatenate([part, still]) for part in (moved.rate, moved.change))
@@ -195,7 +187,7 @@ class Comparison:
         self, mounting: Mounting, columns: Callable[[Array, Array, Array], Array]
     ) -> list[Array]:
         """By joint, columns (K, m) less the losses, from forces (T, n, m) along each motion."""
-        moved = [motion.scaled(mounting.direction) for motion in self.motions]
+        moved = [motion.reread(np.diag(mounting.direction)) for motion in self.motions]
         found = [columns(m.position + mounting.zero, m.rate, m.change) for m in moved]
         parts = [one / self.ratio[:, None] for one in found]
         return [

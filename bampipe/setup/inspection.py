@@ -138,15 +138,11 @@ def _axis(
 ) -> AxisSetup:
     moving = held.moving[place] if held is not None else 1.0
     still = moving < LEAST_MOVING
-    state: AxisState = (
-        "mistaken"
-        if any(axis in mistake.axes or held is None for mistake in mistakes)
-        else "hardly_moves"
-        if still
-        else "unexplained"
-        if held is None or held.left[place] > EXPLAINED
-        else "sound"
-    )
+    state: AxisState = "sound"
+    if any(axis in mistake.axes or held is None for mistake in mistakes):
+        state = "mistaken"
+    elif still or held is None or held.left[place] > EXPLAINED:
+        state = "hardly_moves" if still else "unexplained"
     return AxisSetup(
         state=state,
         error_percent=None if held is None or still else 100.0 * held.error[place],

@@ -55,13 +55,8 @@ class Mounting:
         return [k for k, _ in enumerate(self.zero) if self.direction[k] < 0.0 or self.zero[k]]
 
     @property
-    def is_changed(self) -> bool:
-        """Whether anything differs from the drawing or the stated gravity."""
-        return self.hangs or bool(self.changed)
-
-    @property
     def changes(self) -> float:
-        """Number of joint changes to which the mounting is equivalent in probability."""
+        """Number of joint changes that are as improbable as the mounting; 0 if it is as drawn."""
         size = np.abs(self.gravity)
         leans = size.max() < (1.0 - _ROUNDING) * np.linalg.norm(size)
         return len(self.changed) + self.hangs * (_LEANING if leans else _HANGING)

@@ -265,7 +265,7 @@ class DrawnSearch(Search):
             return found
         # Joint drives are linear in the forces, so the forces give their changes.
         into = self._by_force @ drives @ np.linalg.pinv(self._by_force)
-        return found.driven(into)
+        return replace(found, drives=found.drives @ into.T)
 
     def _hold(
         self, corrections: Sequence[Correction], stated: Comparison

@@ -64,6 +64,7 @@ WRITTEN = {
     "unit row in brackets": table(";", ",").replace("t;x;n\n", "t;x;n\n[s];[mm];[-]\n"),
     "unit row, blanks": table("\t").replace("t\tx\tn\n", "t\tx\tn\ns\tN.m\t\n"),
     "delimiter at the end of lines": table(";", row=lambda c: ";".join(c) + ";"),
+    "behind the last name alone": table(";", header="t,x,n,"),
     "same, header too": table(";", header="t,x,n,", row=lambda c: ";".join(c) + ";"),
     "exponents": table(row=lambda c: ",".join(f"{float(x):.6E}" for x in c)),
     "a column of text with commas": table(

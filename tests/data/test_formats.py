@@ -285,7 +285,8 @@ def write_ros(path: Path, kind: str) -> Path:
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        writer = Writer(path / "bag", version=9, storage_plugin=plugin)
+        version = 8 if kind == "humble" else 9  # which records no definitions
+        writer = Writer(path / "bag", version=version, storage_plugin=plugin)
         write = store.serialize_cdr
         result = path / "bag" / f"bag.{'mcap' if kind == 'mcap' else 'db3'}"
     with writer:
@@ -297,7 +298,7 @@ def write_ros(path: Path, kind: str) -> Path:
     return result
 
 
-@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "humble", "mcap"])
 def test_ros(tmp_path, kind):
     path = write_ros(tmp_path, kind)
     columns = (

@@ -262,7 +262,9 @@ def test_counters_wrap_at_any_width_and_go_on():
         ("t [s],q [deg],torque [% of nominal]", "stated as '% of nominal'"),
         ("t [s],q [furlong],torque [Nm]", "stated as 'furlong'"),
         ("t [s],q [deg],torque [%]", "calibration_n_per_v"),
+        ("t [s],q [deg],torque_percent", 'calibration_n_per_v, N.m for one of "torque_percent"'),
         ("t [s],q [deg],load cell [kg]", "lever_m"),
+        ("t [s],belt [m/s],moment [Nm]", "[Nm] is in Nm and follows the motion, but is none"),
     ],
 )
 def test_a_unit_that_is_not_known_is_asked_for(tmp_path: Path, header: str, asked: str):
@@ -304,6 +306,7 @@ def test_data_of_other_kinds_are_named_with_what_to_do(tmp_path: Path):
         ("(1.5) can0 141#A1250064\n" * 9, "frames of a CAN bus.*; decode them"),
         ("  can0  141   [4]  A1 25 00 64\n" * 9, "frames of a CAN bus.*; decode them"),
         ("t,variable,value\n" + "0.1,q,0.2\n" * 9, "one signal below the other; make it"),
+        ("version https://git-lfs.github.com/spec/v1\nsize 9\n", "fetch the file: git lfs pull"),
         ("# name: t\n# rows: 9\n" + "0.5\n" * 9, "as Octave writes them; save them with"),
     ):
         (tmp_path / "b.csv").write_text(text)
@@ -435,6 +438,9 @@ def test_logs_with_their_time_come_first_and_unnamed_columns_are_alike_in_number
     write(tmp_path / "a/a.csv", "t_s,q_rad,tau_Nm", T, Q, U)
     write(tmp_path / "a/b.csv", "q_rad,tau_Nm", Q[:40], U[:40])
     assert "t_s" in [column.name for column in survey(tmp_path / "a").columns]
+    for n in (1, 2):  # all joints in each, whichever of them moved: trials, and no parts
+        write(tmp_path / f"c/joint_{n}.csv", "t_s,q1_rad,q2_rad,tau1_Nm,tau2_Nm", T, Q, U, U, Q)
+    assert [len(trial.parts) for trial in survey(tmp_path / "c").trials] == [0, 0]
     write(tmp_path / "b/a.csv", "", T, Q, 3.0 * U)
     write(tmp_path / "b/b.csv", "", Q[:20], U[:20])
     found = survey(tmp_path / "b")
@@ -450,5 +456,10 @@ def test_speeds_in_hertz_commands_and_one_reading_in_two_units(tmp_path):
     names = "time [s],commanded angle [rad],a1 position [rad],c1 position [rev],a1 torque [Nm]"
     write(tmp_path / "b/b.csv", names, T, np.roll(Q, -3), Q, Q / TURN, U)
     assert 'column = "a1 position [rad]"' in propose(tmp_path / "b").session
+    (tmp_path / "d").mkdir()
+    table = np.c_[T, Q, U, 3.0 * U].tolist()
+    rows = {"force units": "kip", "displacement units": "in", "data": table}
+    (tmp_path / "d/a.json").write_text(json.dumps(rows))
+    assert [c.unit for c in survey(tmp_path / "d").columns] == ["", "in", "", "kip"]
     (tmp_path / "c.json").write_text(json.dumps({"data": [{"t": [*T, *T], "q": [*Q, *Q]}]}))
     assert set(columns_of(tmp_path / "c.json")) == {"data[0].t", "data[0].q"}

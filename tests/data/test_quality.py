@@ -78,27 +78,22 @@ def test_a_force_of_several_columns_is_their_weighted_sum():
     np.testing.assert_allclose(trial.columns["force_motor"], wanted)
 
 
-def coarse_and_quiet(table):
-    slow = 0.004 * np.sin(np.arange(N) / 60.0)
+def coarse_and_quiet(_):
     noise = 0.0005 * np.random.default_rng(1).normal(size=N)
-    table["force_x"] = 2e-3 * np.round((slow + noise) / 2e-3)
-
-
-def clipped_for_ten_samples(table):
-    table["force_x"] = np.minimum(table["force_x"], np.sort(table["force_x"])[-10])
-
-
-def started_after_a_long_rest(table):
-    table["yaw"] = np.rint(np.where(np.arange(N) < 1450, 0, (np.arange(N) - 1450) * 600.0))
+    return 2e-3 * np.round((0.004 * np.sin(np.arange(N) / 60.0) + noise) / 2e-3)
 
 
 @pytest.mark.parametrize(
-    "change", [coarse_and_quiet, clipped_for_ten_samples, started_after_a_long_rest]
+    ("column", "change"),
+    [
+        ("force_x", coarse_and_quiet),
+        ("force_x", lambda x: np.minimum(x, np.sort(x)[-10])),  # clipped for ten samples
+        ("yaw", lambda _: 600.0 * np.maximum(np.arange(N) - 1450, 0)),  # after a long rest
+    ],
 )
-def test_what_looks_like_a_rail_or_a_jump_and_is_none_is_left(change):
+def test_what_looks_like_a_rail_or_a_jump_and_is_none_is_left(column, change):
     table = columns()
-    change(table)
-    assert cleaned(table).repairs == []
+    assert cleaned(table | {column: change(table[column])}).repairs == []
 
 
 def test_turns_wraps_and_missing_samples():
@@ -189,6 +184,9 @@ def test_a_force_that_is_zeroed_anew_sets_the_trial_aside():
     table["force_x"] = force + 0.7 * (t >= 1.2)
     with pytest.raises(InputError, match=r"jumps and stays there.*end_s and start_s = 1\.2 in"):
         cleaned(table)
+    table["force_x"] = 0.05 * np.sign(np.sin(40.0 * t)) + 0.7 * (t >= 1.2)  # by commands
+    session = session_from({**TABLE, "force": {"columns": ["force_x"], "unit": "N"}}, Path())
+    assert cleaned(table, session=session).repairs == []
 
 
 DAMAGE = st.lists(

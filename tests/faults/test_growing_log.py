@@ -2,7 +2,6 @@
 
 import io
 import itertools
-import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -32,11 +31,6 @@ class Growing(io.FileIO):
         return place
 
 
-def as_lines() -> bytes:
-    rows = (json.dumps({name: float(TABLE[name][n]) for name in TABLE}) for n in range(ROWS))
-    return "\n".join(rows).encode()
-
-
 def as_hdf5(stream: io.BytesIO) -> None:
     with h5py.File(stream, "w") as file:
         for name, values in TABLE.items():
@@ -64,7 +58,7 @@ def binary(write: Callable[[io.BytesIO], object]) -> bytes:
 FRAME = pd.DataFrame(TABLE)
 LOGS: dict[str, tuple[Callable[[], bytes], tuple[str, str]]] = {
     ".csv": (lambda: FRAME.to_csv(index=False, float_format="%.6f").encode(), ("t", "x")),
-    ".jsonl": (as_lines, ("t", "x")),
+    ".jsonl": (lambda: FRAME.to_json(orient="records", lines=True).encode(), ("t", "x")),
     ".json": (lambda: FRAME.to_json(orient="records").encode(), ("t", "x")),
     ".parquet": (lambda: binary(FRAME.to_parquet), ("t", "x")),
     ".mat": (lambda: binary(lambda s: scipy.io.savemat(s, TABLE)), ("t", "x")),

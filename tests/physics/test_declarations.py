@@ -34,10 +34,6 @@ def change(tree, path, value):
         tree[last] = value
 
 
-def compile_device(entries):
-    compile_model(Model(registry.device_from(entries, "lab.toml")))
-
-
 DEVICES = [
     ("name", REMOVE, "'name' is missing"),
     ("schema", "bampipe.device/9", "schema"),
@@ -80,7 +76,7 @@ def test_wrong_device_file_is_refused_with_its_field(path, value, says):
     entries = declaration()
     change(entries, path, value)
     with pytest.raises(InputError) as caught:
-        compile_device(entries)
+        compile_model(Model(registry.device_from(entries, "lab.toml")))
     assert says in str(caught.value) and "\n" not in str(caught.value)
 
 

@@ -32,7 +32,7 @@ from bampipe.physics import registry
 from bampipe.physics.units import check_device
 from bampipe.progress import silent
 from bampipe.setup.proposal import propose, write_proposal
-from bampipe.setup.proposal.notes import COLUMNS, Notes
+from bampipe.setup.proposal.notes import COLUMNS
 from bampipe.setup.proposal.starter import Drive, starter_device
 from bampipe.stages import ingest
 
@@ -178,14 +178,6 @@ def test_tables_of_any_extension_are_read_and_prose_beside_them_is_no_table(tmp_
     np.testing.assert_allclose(found["q_joint"], whole, atol=1e-5)
 
 
-def test_the_unit_of_joints_without_names_is_asked_once() -> None:
-    notes = Notes()
-    looks = [f"column_{n}, which looks like the position of joint_{n}" for n in (1, 2)]
-    comments = [notes.ask("the unit of {}", "the manual", of) for of in looks]
-    assert comments[1].endswith(looks[1])
-    assert notes.questions == [f"the unit of {looks[0]} and {looks[1]}. To find it: the manual"]
-
-
 def arm_log(turned: float = 0.0) -> dict[str, np.ndarray]:
     """The joint's log in rad and N.m, and its time in whole seconds and nanoseconds."""
     columns = joint_log(1)
@@ -284,7 +276,8 @@ def test_nothing_is_overwritten(tmp_path, command: Command):
         ({"a.csv": "", "b.txt": "\0"}, "", "no log that can be read"),
         ({"a.csv": "t,q,force\n" + "0,1,2\n" * 9}, "bma", "did you mean 'bam'"),
         ({"a.csv": "t,q,force\n" + "0,1,2\n" * 9}, "x.toml", "x.toml: no such file"),
-        ({"a.csv": "t,a,b\n0,1,2\n1,2,3\n"}, "", "no column looks like a position"),
+        ({"a.csv": "t,a,b\n0,1,2\n1,2,3\n"}, "", "a position; say in order"),
+        ({"a.json": '[{"a": 1, "b": 2}, {"a": 2}]'}, "", "a position; name them in the log"),
     ],
 )
 def test_folders_that_cannot_be_proposed_for(tmp_path, command: Command, files, device, said):
@@ -514,15 +507,6 @@ def test_a_current_position_is_no_current_and_an_acceleration_drives_nothing(tmp
     assert session["force"]["columns"] == ["?"]
 
 
-def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):
-    session, proposal = proposed_for(
-        labelled("t,angle_deg,w,torque_percent", q=57.29578, u=20.0), tmp_path
-    )
-    assert session["force"]["unit"] == "V" and session["force"]["calibration_n_per_v"] == [[0.0]]
-    (ask,) = proposal.fill_in
-    assert ask.startswith('calibration_n_per_v, N.m for one of "torque_percent". To find')
-
-
 def test_names_can_be_given_to_a_log_without_a_header(tmp_path, command: Command):
     table = np.column_stack(list(labelled("t,q,dq,u").values()))[:1000]
     np.savetxt(tmp_path / "a.csv", table, "%.6f", ",")
@@ -616,6 +600,9 @@ def test_the_gear_of_a_motor_is_what_the_weight_says_and_missed_in_its_torque(tm
     assert session["encoders"]["joint"]["gear_ratio"] == pytest.approx(70.0, rel=0.02)
     assert any("times for one turn of it, by its weight" in line for line in proposal.check)
     assert "moment" in proposal.device and session["encoders"]["joint"]["scale_sd"] < 0.02
+    near = pendulum("t,motor [rev],torque_nm", 6.0 / (2.0 * np.pi), 1.0)
+    encoders = proposed_for(near, tmp_path / "d")[0]["encoders"]
+    assert encoders["joint"]["gear_ratio"] == pytest.approx(6.0, rel=0.02)
     turned = pendulum("T.t,exp.position,exp.torque", 0.159155, 1.0)  # of no stated unit
     assert proposed_for(turned, tmp_path / "c")[0]["encoders"]["joint"]["unit"] == "rev"
     session, proposal = proposed_for(
@@ -648,6 +635,10 @@ def test_recordings_in_a_list_are_trials(tmp_path):
     assert session["encoders"]["joint"]["column"] == "runs[:].q"
     assert any("all.json holds 2 recordings" in line for line in proposal.check)
     assert len(samples(tmp_path, tmp_path / "out", "all_2")) == 3000
+    (tmp_path / "b").mkdir()
+    ends = [{name: run[name][:end] for name in ("q", "tau")} for end in (3000, 2000)]
+    (tmp_path / "b/a.json").write_text(json.dumps({"rate": {"hz": 50}, "data": ends}))
+    assert [t["recording"] for t in proposed(tmp_path / "b")[0]["trials"]] == [1, 2]
 
 
 def test_held_rows_are_proposed_at_their_true_rate(tmp_path):
@@ -716,3 +707,13 @@ def test_what_needs_a_gain_gets_wide_priors(tmp_path):
         device = tomllib.loads((tmp_path / name / "device.toml").read_text())
         inertia = device["parameters"]["inertia"]
         assert inertia["sd"] == pytest.approx((5, 100)[scale > 1] * inertia["prior"], rel=0.05)
+
+
+def test_what_a_drive_moves_is_the_axis_and_a_named_force_comes_before_looks(tmp_path):
+    t, q, u = machine(6)
+    table = {"time_s": t, "pole_angle": np.sin(3.0 * t), "cart_angle": q, "torque_Nm": u}
+    encoders = proposed_for(table, tmp_path)[0]["encoders"]
+    assert [encoder["column"] for encoder in encoders.values()] == ["cart_angle"]
+    v = np.gradient(q, t)
+    table = {"t": t, "A": np.gradient(v, t), "D": q, "V": v, "F": u}
+    assert proposed_for(table, tmp_path / "b")[0]["force"]["columns"] == ["F"]

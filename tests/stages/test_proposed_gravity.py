@@ -83,6 +83,8 @@ def test_a_drive_that_wanders_does_not_tell_weight_from_a_spring() -> None:
         ("weight and cable", "angle [rad]", True, "neither weight nor a spring alone explains it"),
         ("nothing", "angle [rad]", True, "assumed, as of any joint"),
         ("nothing", "yaw [rad]", False, ""),
+        ("nothing", "position[shoulder_pan_joint]", False, ""),
+        ("spring", "motor [rev]", True, "assumed, as of any joint"),
         ("spring", "angle [rad]", False, "no gravity: a torque follows the position as that of a"),
     ],
 )
@@ -95,6 +97,7 @@ def test_the_device_file_says_how_sure_gravity_is(
     content = tomllib.loads(proposal.device)
     assert check_device(registry.device_from(content)) == []
     assert ("moment" in content["parameters"]) == has_weight
+    assert ("gear_ratio of joint" in str(proposal.fill_in)) == ("motor" in name)
     lines = [line for line in proposal.check if "gravity" in line]
     assert (len(lines) == 1 and said in lines[0]) if said else lines == []
     (potential,) = (line for line in proposal.device.splitlines() if "potential =" in line)

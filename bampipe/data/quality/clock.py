@@ -58,9 +58,8 @@ def unroll(t: Array) -> tuple[Array, int, NDArray[np.intp]]:
             goes_on = steps[drops] + period
             near = np.all((goes_on > 0.0) & (goes_on < _NEAR_ROLL * usual))
             if near and np.ptp(t) <= period and usual < 0.1 * period:
-                turns = np.zeros(len(t))
-                turns[drops + 1] = period
-                return t + np.cumsum(turns), bits, drops + 1
+                turned = np.cumsum(np.append(0.0, steps < 0.0))
+                return t + period * turned, bits, drops + 1
     return t, 0, np.empty(0, dtype=np.intp)
 
 
@@ -298,9 +297,8 @@ def drop_backward_stamps(table: TrialTable) -> None:
             remedy='log them more finely; of evenly sampled rows, [time] unit = "samples" counts',
         )
     table.keep(~(repeated | behind))
-    for count, what in zip(
-        counts, ("a repeated time stamp", "a time stamp out of order"), strict=True
-    ):
+    faults = "a repeated time stamp", "a time stamp out of order"
+    for count, what in zip(counts, faults, strict=True):
         if count:
             table.repairs.append(f"{count_noun(count, 'row')} with {what} dropped")
 

@@ -1,7 +1,7 @@
 """Encoder readings: whole counts, no wraps, no jumps; and motion as the kind of trial has it."""
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import median_filter
 
 from bampipe.arrays import Array, Indices
 from bampipe.data.quality.channels import fill_missing, take_out
@@ -86,9 +86,8 @@ def unwrapped(values: Array, turn: float, counts: bool) -> tuple[Array, Indices,
         wraps = np.abs(steps) > period / 2
         near = np.abs(np.abs(steps) - period) < period / 16
         if wraps.any() and near[wraps].all() and np.ptp(values[known]) <= period:
-            passed, found = np.zeros(len(known)), values.copy()
-            passed[1:][wraps] = -np.sign(steps[wraps]) * period
-            found[known] += np.cumsum(passed)
+            found = values.copy()
+            found[known[1:]] -= period * np.cumsum(np.where(wraps, np.sign(steps), 0.0))
             return found, (known[np.flatnonzero(wraps) + 1]).astype(np.int64), words
     return values, np.empty(0, dtype=np.int64), ""
 
@@ -109,8 +108,7 @@ def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:
     if len(jumps) == 0:
         return
     run, total = table.limits.nan_run, len(table)
-    windows = sliding_window_view(np.pad(values, run, mode="edge"), 2 * run + 1)
-    level = np.median(windows, axis=1)
+    level = median_filter(values, 2 * run + 1, mode="nearest")
     level[:run], level[total - run :] = level[run], level[total - run - 1]
     wild = np.abs(values - level) > limit
     lasting = np.flatnonzero(np.abs(np.diff(level)) > limit)

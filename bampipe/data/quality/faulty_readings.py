@@ -196,11 +196,9 @@ def leave_out_rails(table: TrialTable) -> None:
         if column not in volts:
             motions = motions if motions is not None else _motions(table)
             farthest = _beyond(values, rails, motions)
+            if farthest is None:
+                table.notes.append(f"{said}; left in: the motion does not tell if it takes more")
             if not farthest:
-                if farthest is None:
-                    table.notes.append(
-                        f"{said}; left in: the motion does not tell if it takes more"
-                    )
                 continue
             said += f", where the motion takes up to {farthest:.3g}"
         table.repairs.append(f"{said}: left out")
@@ -232,7 +230,8 @@ def _sides(motions: list[SmoothedMotion]) -> Array:
 def refuse_new_zero(table: TrialTable) -> None:
     """Refuse a trial in which a force sensor was re-zeroed: its unexplained part is a single step.
 
-    Devices with another input that may be switched on, such as a brake, are not tested.
+    Devices with another input that may be switched on, such as a brake, are not tested, nor are
+    commands, which go in steps.
     """
     every = max(1, len(table) // _MOST_ROWS)
     force, motions = table.session.force, _motions(table, every)
@@ -241,15 +240,16 @@ def refuse_new_zero(table: TrialTable) -> None:
     inner = motions[0].inner
     basis = np.linalg.qr(_sides(motions)[inner])[0]
     for column in force.columns:
+        if not force.volts and len(np.unique(table.columns[column])) < _FEWEST_LEVELS:
+            continue
         values = motions[0].smooth(table.columns[column][::every])[inner]
         rest = values - basis @ (basis.T @ values)
         # A step after each sample, as smooth as the rest, less what the motion takes of it.
         both = np.column_stack([rest, basis]).T
         along, *own = (np.cumsum(motions[0].smooth(x)[::-1])[::-1] for x in both)
         gain = along**2 / np.maximum(np.arange(len(rest), 0, -1) - np.square(own).sum(axis=0), 1.0)
-        at, left = int(np.argmax(gain)), float(rest @ rest)
-        if gain[at] > _ONE_STEP * left and left > _MATTERS * float(np.var(values)) * len(values):
-            at = every * (at + inner.start)
+        at, left = every * (int(np.argmax(gain)) + inner.start), float(rest @ rest)
+        if gain.max() > _ONE_STEP * left and left > _MATTERS * values.size * np.var(values):
             raise table.fault(
                 "jumps and stays there, whatever the motion: zeroed anew, or another load",
                 column=column,

@@ -25,7 +25,8 @@ TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 """File extensions of tables as text."""
 SHEETS = (".xlsx", ".xlsm")
 """Of workbooks, whose first sheet with rows is read as a text."""
-_AGAIN = "copy it again from the logger"
+_OBJECTS = (".json", ".jsonl", ".ndjson")
+_AGAIN, _UNPACK = "copy it again from the logger", "unpack it, or export it as CSV"
 Reader = ModuleType | arrays.ArrayReader
 _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     (TEXTS, text, "", ""),
@@ -33,7 +34,7 @@ _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     ((".parquet",), parquet, "Parquet file", _AGAIN),
     ((".mat",), mat.READER, "MATLAB file", "save it again from MATLAB"),
     ((".h5", ".hdf5", ".hdf"), hdf5.READER, "HDF5 file", _AGAIN),
-    ((".json", ".jsonl", ".ndjson"), objects.READER, "", ""),
+    (_OBJECTS, objects.READER, "", ""),
     ((".tdms",), tdms.READER, "TDMS file", _AGAIN),
     ((".bag", ".db3"), bag, "bag", f"{_AGAIN}, with the message definitions in it"),
     ((".mcap",), bag, "MCAP file", f"{_AGAIN}, with the message definitions in it"),
@@ -42,6 +43,7 @@ _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
 """File extensions and their reader; of what libraries read, what to do where they cannot."""
 _READERS = {extension: reader for own, reader, _, _ in _FORMATS for extension in own}
 _FOREIGN = {extension: (kind, remedy) for own, _, kind, remedy in _FORMATS for extension in own}
+_FOREIGN[".gz"] = "gzip archive", _AGAIN
 EXTENSIONS = tuple(_READERS)
 """File extensions that can be read."""
 
@@ -54,9 +56,10 @@ _KINDS = (
     (b"#ROSBAG", (".bag",), "a ROS bag"),
     (b"\x89MCAP0", (".mcap",), "an MCAP file"),
     (b"SQLite format 3", (".db3",), "an SQLite file"),
-    (b"PK\x03\x04", ("", ".npz", *SHEETS), "a zip archive or spreadsheet"),
+    (b"PK\x03\x04", (_UNPACK, ".npz", *SHEETS), "a zip archive or spreadsheet"),
     (b"\x93NUMPY", (".npy",), "an array of NumPy"),
-    (b"\x1f\x8b", ("",), "a gzip archive"),
+    (b"\x1f\x8b", (_UNPACK, ".gz"), "a gzip archive"),
+    (b"version https://git-lfs", ("fetch the file: git lfs pull",), "a pointer of Git LFS"),
     (b"MATLAB", (".mat",), "a MATLAB file"),
     (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".mat"), "an HDF5 file"),
 )
@@ -97,12 +100,19 @@ def read_trial(
 
 def is_log(path: Path) -> bool:
     """Whether a file may be a log: by its extension, or as text with rows of numbers."""
-    return path.suffix.lower() in _READERS or text.is_table(path)
+    return extension_of(path.name) in _READERS or text.is_table(path)
 
 
 def is_text(name: str) -> bool:
     """Whether a log is read as text, as those are whose extension is not known."""
-    return _READERS.get(Path(name).suffix.lower(), text) is text
+    return _READERS.get(extension_of(name), text) is text
+
+
+def extension_of(name: str) -> str:
+    """File extension in lower case; of a text or JSON under gzip, that of what it holds."""
+    path = Path(name)
+    inner, own = Path(path.stem).suffix.lower(), path.suffix.lower()
+    return inner if own == ".gz" and inner in (*TEXTS, *_OBJECTS) else own
 
 
 def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) -> dict[str, str]:
@@ -176,7 +186,7 @@ def _reader(path: Path) -> Reader:
 
     InputError where it cannot be read, is empty, unsupported, or of another kind.
     """
-    extension = path.suffix.lower()
+    extension = extension_of(path.name)
     try:
         state = path.stat()
         if not stat.S_ISREG(state.st_mode):
@@ -195,7 +205,7 @@ def _reader(path: Path) -> Reader:
     if head[512:520] == hdf5.SIGNATURE:  # behind a user block of MATLAB
         head = b"MATLAB"
     for magic, right, words in _KINDS:
-        if head.startswith(magic) and extension not in right:
-            remedy = f"name it *{right[0]}" if right[0] else "unpack it, or export it as CSV"
+        if head.startswith(magic) and not {extension, path.suffix.lower()} & set(right):
+            remedy = right[0] if right[0][:1] != "." else f"name it *{right[0]}"
             raise InputError(f"this is {words}, not *{extension}", remedy=remedy)
     return _READERS.get(extension, text)

@@ -30,8 +30,8 @@ _RUN = re.compile(
 )
 """Name of an array of one of several recordings in a file."""
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
-_NUMBERS, _STAMPED, LINK = "iufb", "MOSU", "link"
-"""Kinds of arrays of numbers, and of dates and times or text; of what is elsewhere."""
+_NUMBERS, _STAMPED, LINK, STATED = "iufb", "MOSU", "link", "stated"
+"""Kinds of arrays of numbers, of moments or text, of what is elsewhere, of no more than a unit."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,11 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
     Raises:
         InputError: an array is missing, not a vector of numbers, or not as long as the others.
     """
+    units = {name: array.unit for name, array in arrays.items() if array.kind == STATED}
+    arrays = {name: array for name, array in arrays.items() if name not in units}
     joined, begun = _join_runs(arrays)
     known: Arrays = {**arrays, **joined}
-    values, units = dict[str, np.ndarray](), dict[str, str]()
+    values = dict[str, np.ndarray]()
     for column in wanted.columns:
         variable, index = split_index(column, known)
         array = known.get(variable)
@@ -268,17 +270,6 @@ class ArrayReader:
             return columns_of_arrays(arrays)
 
 
-def _refuse_blocks(arrays: Arrays) -> None:
-    """Refuse a file whose arrays all have three dimensions or more."""
-    blocks = [(name, array.shape) for name, array in arrays.items() if len(array.shape) > 2]
-    if blocks and len(blocks) == len(arrays):
-        name, shape = blocks[0]
-        raise InputError(
-            f"'{name}' is a {_by(shape)} array, of which no side is said to be the samples",
-            remedy="save each trial as an array of its own, samples by channels",
-        )
-
-
 @contextmanager
 def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     """The arrays of a file; the one of a ``.npy`` is called ``data``."""
@@ -295,8 +286,13 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         fields = array.dtype.names
         parts = {f"{key}.{part}": array[part] for part in fields} if fields else {key: array}
         found |= {label: stored(np.atleast_1d(part)) for label, part in parts.items()}
-    if wanted is None:
-        _refuse_blocks(found)
+    blocks = [(name, array.shape) for name, array in found.items() if len(array.shape) > 2]
+    if wanted is None and blocks and len(blocks) == len(found):
+        name, shape = blocks[0]
+        raise InputError(
+            f"'{name}' is a {_by(shape)} array, of which no side is said to be the samples",
+            remedy="save each trial as an array of its own, samples by channels",
+        )
     yield found, ()
 
 

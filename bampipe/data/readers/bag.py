@@ -254,7 +254,9 @@ def _messages(path: Path, topics: Sequence[str]) -> Iterator[tuple[str, int, Any
                     if channel.topic in in_json:
                         yield channel.topic, message.log_time, json.loads(message.data)
                 return
-    with highlevel.AnyReader([path]) as reader:
+    types = need("rosbags.typesys", "ros")
+    standard = types.get_typestore(types.Stores.LATEST)  # ROS 2 did not always record them
+    with highlevel.AnyReader([path], default_typestore=standard) as reader:
         check_columns(sorted(reader.topics), topics)
         chosen = [c for c in reader.connections if not topics or c.topic in topics]
         if not chosen:

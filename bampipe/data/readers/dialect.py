@@ -236,6 +236,7 @@ def _header(
 
     def names(index: int, delimiter: str) -> list[str]:
         row = _names(lines[index].text, delimiter, lines[index + 1 :], lines[:index])
+        row = _trimmed(row, width)
         # It may be written otherwise than the samples.
         fits = len(row) in (width, width - 1)
         return row if fits else next(iter(_otherwise(lines[index].text, width)), row)
@@ -270,6 +271,11 @@ def _header(
 def _filled(lines: list[Line]) -> list[int]:
     """Places of the lines that are not blank."""
     return [n for n, line in enumerate(lines) if line.text.strip()]
+
+
+def _trimmed(row: list[str], width: int) -> list[str]:
+    """A header without what is behind a last delimiter that the ``width`` cells below lack."""
+    return row[:-1] if len(row) == width + 1 and not row[-1] else row
 
 
 def _otherwise(text: str, width: int) -> list[list[str]]:
@@ -396,7 +402,8 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
     if first >= len(lines):
         return next(iter(_filled(lines)), -1)
     width, above = len(cells(lines[first].text, delimiter)), _filled(lines[:first])[-4:]
-    rows = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above}
+    bare = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above}
+    rows = {n: _trimmed(row, width) for n, row in bare.items()}
     for n, row in rows.items():
         if not width - 1 <= len(row) <= width:
             rows[n] = next(iter(_otherwise(lines[n].text, width)), row)
@@ -415,9 +422,9 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
             break
         if _is_key_of_names(row):
             return n
-    bare = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
-    if bare and bare[-1] != fitting[-1]:
-        return bare[-1]  # what is below has numbers, and cells that are empty
+    wordy = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
+    if wordy and wordy[-1] != fitting[-1]:
+        return wordy[-1]  # what is below has numbers, and cells that are empty
     if len(fitting) > 1 and _are_units(rows[fitting[-1]]) and len(rows[fitting[-2]]) == width:
         return fitting[-2]
     return fitting[-1] if fitting else -1

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import ArrayReader, Opened, Stored, called_signals, stored
+from bampipe.data.readers.arrays import STATED, ArrayReader, Opened, Stored, called_signals, stored
 from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
-from bampipe.data.readers.trial import Wanted
+from bampipe.data.readers.trial import Wanted, opened
 from bampipe.data.units import units_beside
 from bampipe.errors import InputError
 
@@ -28,11 +28,6 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
 
 
 READER = ArrayReader("value", _opened)
-
-
-def stated_units(path: Path) -> dict[str, str]:
-    """Units stated beside the samples, such as ``"force units": "kip"``, by quantity."""
-    return units_beside(_texts(_parsed(path.read_text(encoding="utf-8-sig"))))
 
 
 def _texts(content: object) -> dict[str, str]:
@@ -90,15 +85,14 @@ def _contents(path: Path, wanted: Sequence[str]) -> Opened:
     Raises:
         InputError: not JSON, or no such list.
     """
-    data = path.read_bytes()
     try:
-        text = data.decode("utf-8-sig")
+        with opened(path) as stream:
+            text = stream.read().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError("not UTF-8 text", remedy="save it as UTF-8") from error
-    del data
     notes: tuple[str, ...] = ()
     content: object = None
-    if path.suffix.lower() in (".jsonl", ".ndjson"):
+    if {".jsonl", ".ndjson"} & {suffix.lower() for suffix in path.suffixes[-2:]}:
         lines = [line for line in text.splitlines() if line.strip()]
         content = parsed = [_parsed(x, f"sample {n}") for n, x in enumerate(lines[:-1], 1)]
         try:
@@ -124,7 +118,7 @@ def _contents(path: Path, wanted: Sequence[str]) -> Opened:
         kinds = {label: "M" * (array.dtype.kind == "O") for label, array in arrays.items()}
         called = called_signals(arrays, texts).items()
         held = {name: stored(arrays[x], unit, kinds[x]) for x, (name, unit) in called}
-        return held | alone, notes
+        return _stating(held | alone, units), notes
     if not isinstance(content, list) and len(lists) != 1:
         raise InputError(
             f"{len(lists)} lists of samples: {', '.join(lists)}"
@@ -141,7 +135,12 @@ def _contents(path: Path, wanted: Sequence[str]) -> Opened:
     named = [x for x, cell in leaves(samples[0]) if reads_as_number(cell) or _is_moment(cell)]
     named += [name for name in wanted if find(samples[0], name) is not MISSING]
     found = {name: _column(samples, name, units) for name in dict.fromkeys(named)}
-    return {**found, **{x: alone[x] for x in alone if x not in found}}, notes
+    return _stating(found | {x: alone[x] for x in alone if x not in found}, units), notes
+
+
+def _stating(found: Mapping[str, Stored], units: Mapping[str, str]) -> dict[str, Stored]:
+    """What was found and the units of other quantities, such as ``"force units": "kip"``."""
+    return {**found, **{x: stored(None, u, STATED) for x, u in units.items() if x not in found}}
 
 
 def _column(samples: Sequence[object], name: str, units: Mapping[str, str]) -> Stored:

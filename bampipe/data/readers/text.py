@@ -20,7 +20,7 @@ import pyarrow.csv as pa_csv
 from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments, rewriting
 from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
-from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, need
+from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, need, opened
 from bampipe.errors import InputError, located
 
 BLOCK = 1 << 20
@@ -88,7 +88,7 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
 
     InputError where it is not in the encoding that it claims.
     """
-    with path.open("rb") as file:
+    with opened(path) as file:
         stream = _sheet(file) if path.suffix.lower().startswith(".xls") else file
         head = stream.read(HEAD)
         stream.seek(0)

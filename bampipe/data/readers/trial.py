@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import ModuleType
-from typing import Literal
+from typing import BinaryIO, Literal, cast
 
 import numpy as np
 from pydantic import Field
@@ -162,6 +164,11 @@ def interpolated(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.nd
         return np.full(len(at), np.nan)
     order = known[np.argsort(times[known], kind="stable")]
     return np.asarray(np.interp(at, times[order], values[order], left=np.nan, right=np.nan))
+
+
+def opened(path: Path) -> BinaryIO:
+    """The file, or what gzip holds of it."""
+    return cast(BinaryIO, gzip.open(path)) if path.suffix.lower() == ".gz" else path.open("rb")
 
 
 def need(module: str, extra: str) -> ModuleType:

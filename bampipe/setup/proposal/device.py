@@ -10,7 +10,9 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.chain import Branches
 from bampipe.data.device_file import complete_device, read_device_file
+from bampipe.data.readers import is_text
 from bampipe.data.survey import REFERENCE_WORDS, Survey, SurveyedColumn, words
+from bampipe.data.units import unit
 from bampipe.data.urdf import unexpanded
 from bampipe.errors import InputError
 from bampipe.estimate.white_noise import counting_step, white_noise_sd
@@ -79,8 +81,7 @@ def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None
         # That of a robot may be three lines without a schema.
         schema = content.get("schema", _SCHEMA if "robot" in content else "")
         if schema == _SCHEMA:
-            device = registry.device_from(read_device_file(path), str(path))
-            return ChosenDevice(path.name, device)
+            return ChosenDevice(path.name, registry.device_from(read_device_file(path), str(path)))
     return _robot(folder, found) or _built_in(found)
 
 
@@ -129,8 +130,7 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
         text += f'tip = "{logged or error.stem}"  # guess: {why}\n'
         device = _complete(folder, text)
     chosen = ChosenDevice(DEVICE, device, text)
-    by_torque = any(not c.is_constant for c in found.of("force"))
-    if by_torque or not found.of("current"):
+    if any(not c.is_constant for c in found.of("force")) or not found.of("current"):
         return chosen
     return with_motors(folder, chosen, {c.name: (1.0, 1.0) for c in chosen.device.coordinates})
 
@@ -194,9 +194,8 @@ def _built_in(found: Survey) -> ChosenDevice | None:
     columns = [set(words(column.name)) for column in found.columns]
     for name in registry.device_names():
         device = registry.device(name)
-        inputs = [
-            set(words(name.removeprefix("force_"))) for name in (*device.forces, *device.channels)
-        ]
+        names = (*device.forces, *device.channels)
+        inputs = [set(words(name.removeprefix("force_"))) for name in names]
         named = all(any(said <= column for column in columns) for said in inputs)
         if named and {c.name for c in device.coordinates} <= positions:
             return ChosenDevice(name, device)
@@ -212,11 +211,13 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     found = match.found
     position = match.position("", 1, notes)
     if position is None:
+        way = "say in order what they are: bampipe init FOLDER --names t,angle_deg,..."
+        if not is_text(found.trials[0].file):
+            way = "name them in the log for what they are, as t and angle_deg"
         raise InputError(
             "no column looks like a position",
             where=f"{folder}: {found.trials[0].file}",
-            remedy="say in order what they are: bampipe init FOLDER --names t,angle_deg,...;"
-            f" columns are {', '.join(c.name for c in found.columns[:12])}",
+            remedy=f"{way}; columns are {', '.join(c.name for c in found.columns[:12])}",
         )
     linear = slides(position, found)
     driver, role = match.driver(position)
@@ -238,7 +239,9 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         levered = driver.si == "V" or needs_gain(driver) or (not linear and is_force(driver))
         drive = replace(drive, scaled=role == "force" and not levered)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
-    weight, on_gravity = weight_of(position, fit, linear, found)
+    springs = fit.pose is not None and fit.pose.reading == "spring"
+    match.geared = position.name if springs and _may_be_geared(position) else ""
+    weight, on_gravity = weight_of(position, fit, linear, found, bool(match.geared))
     name = position.name.removesuffix(f" [{read.stated}]")
     starter = starter_device(name, linear, drive, fit, weight, width)
     match.given = {starter.axis: read}
@@ -257,11 +260,9 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         " know of it"
     )
     if starter.placeholders:
-        several = len(starter.placeholders) > 1
-        notes.check.append(
-            f"{DEVICE}: {join_names(starter.placeholders)} {'are' if several else 'is'} not yours"
-            f" yet: all forces and inertias scale with {'them' if several else 'it'}"
-        )
+        are, them = ("are", "them") if len(starter.placeholders) > 1 else ("is", "it")
+        said = f"{join_names(starter.placeholders)} {are} not yours yet"
+        notes.check.append(f"{DEVICE}: {said}: all forces and inertias scale with {them}")
     if on_gravity:
         notes.check.append(f"{DEVICE}: on '{starter.axis}', {on_gravity}")
     columns = {"supply": supply, starter.input: driver}
@@ -305,7 +306,7 @@ def _at_joint(
 
     That tells the unit of a position that has none, and the size of counts and of a motor's angle.
     """
-    far = position.si == "rad" and np.ptp(position.values) * position.scale > MOST_TRAVEL
+    far = _may_be_geared(position)
     unsaid = not position.stated and position.si is None
     if driver is None or not (far or unsaid or in_counts(position)) or is_velocity(position):
         return position, position
@@ -324,6 +325,13 @@ def _at_joint(
     return position, replace(position, values=angle, stated="rad", unit="rad")
 
 
+def _may_be_geared(position: SurveyedColumn) -> bool:
+    """Whether an angle is rather a motor's before its gear: by its name, in turns, or by travel."""
+    travel = float(np.ptp(position.values)) * position.scale
+    of_motor = "motor" in words(position.name) or unit(position.unit) == unit("rev")
+    return position.si == "rad" and (of_motor or travel > MOST_TRAVEL)
+
+
 def _sign_width(position: SurveyedColumn, t: np.ndarray, linear: bool) -> float:
     """Width for the sign of the velocity, rad/s or m/s, where less than the usual; else 0.
 
@@ -332,8 +340,8 @@ def _sign_width(position: SurveyedColumn, t: np.ndarray, linear: bool) -> float:
     compliance; filtered velocities know the sign down to a fortieth of a step a sample.
     """
     kind = "linear" if linear else "rotary"
-    unit, _, usual = KINDS[kind]
-    q = position_in_si(position, t, unit)
+    si, _, usual = KINDS[kind]
+    q = position_in_si(position, t, si)
     step = counting_step(q)
     step = max(step, float(np.sqrt(12.0)) * float(np.nan_to_num(white_noise_sd(q, t, step))))
     width = max(step / float(np.median(np.diff(t))) / 40.0, usual / 20.0)

@@ -36,6 +36,7 @@ class Matcher:
         turning: what the readings of a position are worth, by the weight on it, by name of column.
         given: columns that are known, by name of axis or input.
         reacting: the column of a drive that has the sign of the reaction, "" where none has.
+        geared: the position that may be a motor's before a gear of which nothing tells, by name.
         rivals: names of columns that may be the position, where there are several.
         scale_sd: field of the uncertainty of a scale that is guessed, by name of axis or input.
     """
@@ -48,6 +49,7 @@ class Matcher:
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
     given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
     reacting: str = ""
+    geared: str = ""
     rivals: list[str] = field(default_factory=list)
     scale_sd: dict[str, str] = field(default_factory=dict)
 
@@ -86,7 +88,21 @@ class Matcher:
             alike = 0.9 < abs(float(np.corrcoef(best.values, other.values)[0, 1])) < _SAME
             best = other if alike and guesses.follows(best.values, other.values) else best
         self.rivals = [c.name for c in found]
-        return best
+        drives = [c for c in self.found.of(*DRIVERS) if not c.is_constant]
+        if len(drives) != 1:
+            return best
+        # Of a pole on a cart and the cart, what is driven is the cart.
+        share = {c.name: self._share(c, drives[0]) for c in found}
+        most = max(found, key=lambda c: share[c.name])
+        clear = 1.0 - share[most.name] < guesses.CLEARLY * (1.0 - share[best.name])
+        return most if clear and share[most.name] >= guesses.MOVED else best
+
+    def _share(self, position: SurveyedColumn, column: SurveyedColumn) -> float:
+        """The share of a column that the motion of a position explains, 0 if it is the position."""
+        values = np.nan_to_num(column.values)
+        if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
+            return 0.0
+        return guesses.driven(self.t, travelled(position, self.t), values).share
 
     def inputs(
         self, wanted: Mapping[str, str], axes: tuple[SurveyedColumn, ...]
@@ -153,10 +169,7 @@ class Matcher:
             of_axis = column is position or column.si in ("rad", "m")
             if known or column.is_constant or of_axis or asked & set(words(column.name)):
                 continue
-            values = np.nan_to_num(column.values)
-            if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
-                continue
-            share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
+            share[column.name] = self._share(position, column)
         roles = {column.name: column.role for column in self.found.columns}
         fitting = [name for name in share if share[name] >= guesses.DRIVEN]
         number, at_motor = _numbers(position.name), "motor" in words(position.name)

@@ -92,15 +92,9 @@ class Logged:
         motion = JointMotion(
             *(savgol_filter(q, window, 2, deriv=k, delta=step, axis=0)[rows] for k in range(3))
         )
-        return Comparison(
-            self.robot,
-            tuple(c.unit == "rad" for c in self.device.coordinates),
-            [motion],
-            np.column_stack([scale_to(unit, c) * np.nan_to_num(c.values) for c in drives.columns])[
-                rows
-            ],
-            ratio,
-        )
+        forces = [scale_to(unit, c) * np.nan_to_num(c.values)[rows] for c in drives.columns]
+        turning = tuple(c.unit == "rad" for c in self.device.coordinates)
+        return Comparison(self.robot, turning, [motion], np.column_stack(forces), ratio)
 
     def explain(self, q: Array, drives: Group, ratio: Array) -> Gears | None:
         """How the drawing explains the drives, best mounted; None where they do not compare."""
@@ -110,7 +104,7 @@ class Logged:
         mounting, judged = many.drawn, many.hold(many.drawn)
         if max(drive.left for drive in judged) >= DOUBTED:
             mounting = find_mounting(few.turning, few.drawn, few.misfit)
-            judged = many.hold(mounting) if mounting.is_changed else judged
+            judged = many.hold(mounting) if mounting.changes else judged
         return Gears(ratio, mounting, judged)
 
     def explain_geared(self, q: Array, drives: Group, turns: Array) -> Gears | None:
@@ -177,7 +171,7 @@ class Logged:
                 # Wrong zeros with reductions to match explain much; only the right ones all.
                 if found is not None and mean_left(found.drives) < _SURE_LEFT:
                     return found
-        return found if found is not None and not found.mounting.is_changed else None
+        return found if found is not None and not found.mounting.changes else None
 
 
 @dataclass(frozen=True)
@@ -396,16 +390,10 @@ def _sentences(
     for c, (name, drive) in zip(device.coordinates, drives.items(), strict=True):
         column = columns[name].name
         if not drive.is_sure:
-            by_friction = "; by its friction it is right" if drive.is_dissipative else ""
-            if drive.is_turned:
-                by_friction = (
-                    f"; by its friction it is turned, or that of {c.name} is the wrong one"
-                )
-            if not together:
-                lines.append(
-                    f"{column}: too little weight and inertia act on {c.name} to tell its sign"
-                    f"{by_friction}"
-                )
+            said = [f"{column}: too little weight and inertia act on {c.name} to tell its sign"]
+            said += ["it is right"] if drive.is_dissipative else []
+            said += [f"it is turned, or that of {c.name} is the wrong one"] * drive.is_turned
+            lines += [] if together else ["; by its friction ".join(said)]
             continue
         size, share = abs(drive.share), -drive.share if together else drive.share
         said = []

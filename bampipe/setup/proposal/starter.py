@@ -46,8 +46,8 @@ _DOUBTS: dict[Reading, str] = {
     "both": "a torque follows the angle, and neither weight nor a spring alone explains it; what is"
     " beside it, a cable, a spring, a ripple, is for diagnose to name",
 }
-_LEAST_WEIGHT = 1e-3
-"""Of what friction gives, N.m, as the spread of a weight of which nothing shows."""
+_LEAST_WEIGHT, _USUAL_GEAR = 1e-3, 10.0
+"""Spread of a weight of which nothing shows, N.m; turns of a motor whose gear is not known."""
 
 
 @dataclass(frozen=True)
@@ -95,17 +95,18 @@ class Starter:
 
 
 def weight_of(
-    position: SurveyedColumn, fit: Driven, linear: bool, found: Survey
+    position: SurveyedColumn, fit: Driven, linear: bool, found: Survey, geared: bool
 ) -> tuple[Weight | None, str]:
     """Gravity for the device file of an axis, None where it has none, and a sentence on it.
 
     A joint whose mounting is not known is more likely to carry weight than not, and an axis
-    whose model lacks gravity has its weight explained by springs and unbalance.
+    whose model lacks gravity has its weight explained by springs and unbalance. Behind a gear of
+    unknown ratio, weight goes with the angle of the motor as a spring's torque does: ``geared``.
     """
     if linear:
         return None, ""
     reading = fit.pose.reading if fit.pose is not None else "nothing"
-    if fit.pose is not None and reading == "spring":
+    if fit.pose is not None and reading == "spring" and not geared:
         return None, (
             "no gravity: a torque follows the position as that of a spring does, not as weight"
             " does; diagnose has a name for it"
@@ -114,22 +115,22 @@ def weight_of(
         doubt = _DOUBTS.get(reading, "")
         said = f"gravity: {doubt}" if doubt else "gravity, since the motion shows it"
         return Weight(fit.pose.moments, max(map(abs, fit.pose.moments)), doubt), said
-    if not _may_carry(position, found):
+    if not _may_carry(position, found, geared):
         return None, ""
     moments = fit.pose.moments if fit.pose is not None else (0.0, 0.0)
-    size = max(*map(abs, moments), fit.coulomb, _LEAST_WEIGHT)
+    size = max(*map(abs, moments), fit.coulomb, _LEAST_WEIGHT) * (_USUAL_GEAR if geared else 1.0)
     doubt = "assumed, as of any joint: the motion does not show it"
     return Weight((0.0, 0.0), size, doubt), f"gravity is {doubt}"
 
 
-def _may_carry(position: SurveyedColumn, found: Survey) -> bool:
+def _may_carry(position: SurveyedColumn, found: Survey, geared: bool) -> bool:
     """Whether an axis whose drive shows no weight is a joint all the same."""
-    said, turns = set(words(position.name)), position.si == "rad"
+    said, turns = set(words(re.sub(r"[\[\]]", " ", position.name))), position.si == "rad"
     is_angle = turns or said & _ANGLES or any(c.si == "N.m" for c in found.of("force"))
     if not is_angle or said & _UPRIGHT:
         return False
-    scale = position.scale if turns else 1.0
-    return in_counts(position) or float(np.ptp(position.values)) * scale <= MOST_TRAVEL
+    travel = float(np.ptp(position.values)) * (position.scale if turns else 1.0)
+    return geared or in_counts(position) or travel <= MOST_TRAVEL
 
 
 def starter_device(
@@ -158,12 +159,10 @@ def starter_device(
     rate = "N.s/m" if linear else "N.m.s/rad"
     source, unit, applied, constants = _input_of(axis, linear, torque, drive)
     channels = 'channels = { supply = "V" }\n' if drive.supply and not linear else ""
-    rubbed = ""
+    rubbed, width = "", f"sign_width = {sign_width:g}  # guess: the encoder tells speeds as low\n"
     if drive.coil:
         channels = 'channels = { coil_current = "A" }\n'
         rubbed = f" - abs(coil_current)*(friction_per_ampere*sgn({qd}) + viscous_per_ampere*{qd})"
-    width = f"sign_width = {sign_width:g}  # guess: the encoder tells speeds as low\n"
-    if drive.coil:
         width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
     motor = drive.role != "force" or not _FROM_A_MOTOR.isdisjoint(words(drive.column))
     text = f'''# Proposed by `bampipe init`: one axis with inertia and friction

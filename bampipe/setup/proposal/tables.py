@@ -177,8 +177,7 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
 def _counts_on(column: SurveyedColumn) -> bool:
     """Whether a column whose name says nothing rises evenly, otherwise than as a number of rows."""
     steps = np.diff(column.values)
-    rises = len(steps) > 3 and bool(np.all(steps > 0.0))
-    return rises and bool(np.ptp(steps) < np.median(steps)) and float(np.median(steps)) != 1.0
+    return guesses.is_time(column.values) and bool(np.ptp(steps) < np.median(steps) != 1.0)
 
 
 def _numbers_rows(column: SurveyedColumn) -> bool:
@@ -242,6 +241,12 @@ def _encoder(
             f"{column.name} is the position of the motor of {axis.name}, which turns {turns:.4g} ±"
             f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
             " the angle; put in the ratio of the gear"
+        )
+    if column.name == match.geared:
+        said = spelled(column.unit, _POSITION_UNITS)
+        return entry(column.name, said, ", gear_ratio = 0.0") + notes.ask(
+            f"gear_ratio of {axis.name}, turns of {column.name} for one of it, 1 without a gear",
+            "the gear's data sheet; the torque goes with the angle as weight behind a gear does",
         )
     right, geared = column.si == axis.unit, axis.name in match.robot.gears
     if (column.by_looks or column.is_foreign) and not right:
@@ -366,14 +371,12 @@ def _force_table(
     device: Device, columns: list[SurveyedColumn], why: str, notes: Notes
 ) -> list[str]:
     names = [column.name for column in columns] or [UNKNOWN] * len(device.forces)
-    components = ", ".join(f'"{name}"' for name in device.components)
-    which = " and ".join(device.forces)
-    ask = "" if columns else notes.ask_column(which, device.force_unit)
+    ask = "" if columns else notes.ask_column(" and ".join(device.forces), device.force_unit)
     stated = [f'unit = "{device.force_unit}"']
     return [
         "[force]",
-        f"columns = [{', '.join(quoted(name) for name in names)}]{ask}",
-        f"components = [{components}]",
+        f"columns = [{', '.join(map(quoted, names))}]{ask}",
+        f"components = [{', '.join(map(quoted, device.components))}]",
         *(_force_unit(device, columns, why, notes) if columns else stated),
         "",
     ]
@@ -423,7 +426,9 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             'ask who wrote the logger; "N.m" and "N" are usual, and volts or counts are "V" with'
             " a calibration_n_per_v",
         )
-    other = next((c for c in columns if c.si not in (None, "", "V", "kg", "N", "N.m")), None)
+    other = next(
+        (c for c in columns if c.si not in (None, "", "V", "kg", "N", device.force_unit)), None
+    )
     if other is not None:
         return ask_unit(
             f"the force: {other.name} is in {bare(other.unit)} and follows the motion, but is none",
@@ -448,8 +453,7 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
 
 
 def _brakes_table(device: Device, match: Matcher, notes: Notes) -> list[str]:
-    named = {axis: match.named(name, "brake") for axis, name in device.brakes.items()}
-    brakes = {axis: column for axis, column in named.items() if column is not None}
+    brakes = {axis: c for axis, n in device.brakes.items() if (c := match.named(n, "brake"))}
     if not brakes:
         return []
     match.used |= {column.name for column in brakes.values()}
