@@ -25,16 +25,13 @@ LARGEST_BYTES = 4 << 30
 class Dialect(Declaration):
     """What a session says about its text files; what it leaves open is found in the file."""
 
-    delimiter: Literal["", ",", ";", "\t", "|", " "] = Field(
-        default="", description="What stands between columns; a blank: any number of them"
-    )
+    delimiter: Literal["", ",", ";", "\t", "|", " "] = ""
+    """What stands between columns; a blank: any number of them"""
     decimal: Literal["", ".", ","] = Field(default="", description="Decimal sign")
-    encoding: Literal["", "utf-8", "utf-16", "latin-1", "cp1252"] = Field(
-        default="", description="Of the characters"
-    )
-    names: Distinct[Text] = Field(
-        default=(), description="Names of the columns, for files without a header"
-    )
+    encoding: Literal["", "utf-8", "utf-16", "latin-1", "cp1252"] = ""
+    """Of the characters"""
+    names: Distinct[Text] = ()
+    """Names of the columns, for files without a header"""
     missing: Distinct[Text] = Field(
         default=(), description='What a cell says that holds no reading, such as "ovf"'
     )

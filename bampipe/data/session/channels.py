@@ -96,22 +96,17 @@ class Clock(Declaration):
     """The time column."""
 
     column: str = Field(default="", description="Its name; left out where samples are counted")
-    unit: Literal[TimeUnit, "samples", "ticks"] = Field(
-        description="datetime: dates and times; samples: no column, one sample each"
-        " 1/sample_rate_hz; ticks: of a counter, see ticks_per_s"
-    )
+    unit: Literal[TimeUnit, "samples", "ticks"]
+    """datetime: dates and times; samples: no column, one sample each 1/sample_rate_hz; ticks: of a
+    counter, see ticks_per_s"""
     ticks_per_s: Positive | None = Field(
         default=None, description='Rate of the counter, 1/s, where unit = "ticks"'
     )
-    format: str = Field(
-        default="",
-        description="How dates and times are written, in the codes of strptime; ISO 8601, or the"
-        " time of day, where left out",
-    )
-    nanoseconds: str = Field(
-        default="",
-        description="A second column of nanoseconds on top of whole seconds, as in ROS stamps",
-    )
+    format: str = ""
+    """How dates and times are written, in the codes of strptime; ISO 8601, or the time of day,
+    where left out"""
+    nanoseconds: str = ""
+    """A second column of nanoseconds on top of whole seconds, as in ROS stamps"""
 
     @property
     def datetime(self) -> bool:
@@ -155,38 +150,27 @@ class Encoder(NamedDeclaration):
     """Position of one axis: (counts - zero_counts) / counts_per_unit, or as it stands."""
 
     column: Column
-    counts_per_unit: Number | None = Field(
-        default=None, description="Counts in one unit, negative to turn the axis round"
-    )
-    gear_ratio: Number = Field(
-        default=1.0,
-        description="Of a position on the side of the motor: what it travels for one of the axis,"
-        " negative where it turns the other way round",
-    )
+    counts_per_unit: Number | None = None
+    """Counts in one unit, negative to turn the axis round"""
+    gear_ratio: Number = 1.0
+    """Of a position on the side of the motor: what it travels for one of the axis, negative where
+    it turns the other way round"""
     zero: Number = Field(default=0.0, alias="zero_counts", description="Raw reading at position 0")
     stated_unit: Annotated[str, _unit_of("rad", "m", "rad/s", "m/s")] = Field(
         alias="unit",
         description="Such as deg, mm or 0.088deg; a unit of velocity where no position was"
         " recorded: it is integrated",
     )
-    scale_sd: Uncertainty = Field(
-        default=0.0, description="Standard uncertainty of its scale, as a share: 0.001 for 0.1 %"
-    )
-    velocity: Velocity | None = Field(
-        default=None,
-        description="A velocity recorded beside it: checks unit and sign of the position",
-    )
-    stated_resolution: Positive | None = Field(
-        default=None,
-        alias="resolution",
-        description="Smallest step of a column that is not in counts, in its unit",
-    )
+    scale_sd: Uncertainty = 0.0
+    """Standard uncertainty of its scale, as a share: 0.001 for 0.1 %"""
+    velocity: Velocity | None = None
+    """A velocity recorded beside it: checks unit and sign of the position"""
+    stated_resolution: Positive | None = Field(default=None, alias="resolution")
+    """Smallest step of a column that is not in counts, in its unit"""
     sign_bit: SignBit = None
-    also_reads: dict[ChannelName, Number] = Field(
-        default={},
-        description="Of an encoder on a motor that several joints turn: what it reads of other"
-        " axes beside its own, units of it for one of theirs",
-    )
+    also_reads: dict[ChannelName, Number] = Field(default={})
+    """Of an encoder on a motor that several joints turn: what it reads of other axes beside its
+    own, units of it for one of theirs"""
 
     @property
     def unit(self) -> Literal["rad", "m"]:
@@ -277,38 +261,24 @@ class Force(Declaration):
     raw_unit: Annotated[str, _unit_of("N", "N.m", "V")] = Field(
         alias="unit", description="Of the columns, such as kN or mN.m; only V needs a calibration"
     )
-    lever: NotNegative | None = Field(
-        default=None,
-        alias="lever_m",
-        description="Distance from the axis at which a force acts, m: makes a torque in N.m of it",
-    )
-    reaction: bool = Field(
-        default=False,
-        description="The sensor shows what the machine exerts, as one at the foot of a motor or a"
-        " brake does: its sign is turned",
-    )
+    lever: NotNegative | None = Field(default=None, alias="lever_m")
+    """Distance from the axis at which a force acts, m: makes a torque in N.m of it"""
+    reaction: bool = False
+    """The sensor shows what the machine exerts, as one at the foot of a motor or a brake does: its
+    sign is turned"""
     frame: str = Field(default="", description="In which the components are given: free text")
     calibration_n_per_v: (
         Annotated[Several[Annotated[Several[Number], Field(min_length=1)]], Field(min_length=1)]
         | None
     ) = Field(default=None, description="One row a component, one number a column")
-    zero_v: Several[Number] | None = Field(
-        default=None, description="Reading of each column without load"
-    )
-    gain_sd: Uncertainty = Field(
-        default=0.0,
-        description="Standard uncertainty of each component's gain, as a share: 0.01 for 1 %",
-    )
-    crosstalk_sd: Uncertainty = Field(
-        default=0.0,
-        description="Standard uncertainty of how much of another component each one shows, as a"
-        " share",
-    )
-    noise_sd: NotNegative | None = Field(
-        default=None,
-        alias="noise_sd_n",
-        description="Standard deviation at rest, after calibration",
-    )
+    zero_v: Several[Number] | None = None
+    """Reading of each column without load"""
+    gain_sd: Uncertainty = 0.0
+    """Standard uncertainty of each component's gain, as a share: 0.01 for 1 %"""
+    crosstalk_sd: Uncertainty = 0.0
+    """Standard uncertainty of how much of another component each one shows, as a share"""
+    noise_sd: NotNegative | None = Field(default=None, alias="noise_sd_n")
+    """Standard deviation at rest, after calibration"""
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -499,29 +469,21 @@ class Channel(NamedDeclaration):
 
     column: Column
     stated_unit: str = Field(alias="unit", description="Of the scaled value; results are in SI")
-    stated_scale: Number = Field(
-        default=1.0, alias="scale", description="What a raw reading is multiplied by"
-    )
-    stated_offset: Number = Field(
-        default=0.0, alias="offset", description="What is then added, in the unit"
-    )
-    scale_sd: Uncertainty = Field(
-        default=0.0, description="Standard uncertainty of its scale, as a share: 0.01 for 1 %"
-    )
-    wrap_bits: Literal[8, 16, 24, 32] | None = Field(
-        default=None,
-        description="The column is a register of so many bits; with signed = true its upper half"
-        " stands for negative numbers (two's complement)",
-    )
-    signed: bool = Field(
-        default=False, description="Whether a register of wrap_bits holds negative numbers"
-    )
+    stated_scale: Number = Field(default=1.0, alias="scale")
+    """What a raw reading is multiplied by"""
+    stated_offset: Number = Field(default=0.0, alias="offset")
+    """What is then added, in the unit"""
+    scale_sd: Uncertainty = 0.0
+    """Standard uncertainty of its scale, as a share: 0.01 for 1 %"""
+    wrap_bits: Literal[8, 16, 24, 32] | None = None
+    """The column is a register of so many bits; with signed = true its upper half stands for
+    negative numbers (two's complement)"""
+    signed: bool = False
+    """Whether a register of wrap_bits holds negative numbers"""
     sign_bit: SignBit = None
-    second_encoder_of: str = Field(
-        default="",
-        description="Axis of which it reads the position on the other side of the gear, in the"
-        " axis' unit: how far both move apart shows the gear's stiffness and play",
-    )
+    second_encoder_of: str = ""
+    """Axis of which it reads the position on the other side of the gear, in the axis' unit: how far
+    both move apart shows the gear's stiffness and play"""
 
     @property
     def _raw(self) -> units.RecordedUnit:

@@ -126,64 +126,45 @@ class Part(Declaration):
     """One ``[[trials.parts]]`` entry: another file of the same recording."""
 
     file: LogPath
-    name: ChannelName = Field(
-        description="What its columns are called by: force:Fx is Fx of the part force"
-    )
-    join: Literal["rows", "time", "start"] = Field(
-        default="rows",
-        description="rows: sample by sample; time: between its samples, by its time column, which"
-        " is on the clock of the trial's file; start: the same, both counted from their first"
-        " sample",
-    )
+    name: ChannelName
+    """What its columns are called by: force:Fx is Fx of the part force"""
+    join: Literal["rows", "time", "start"] = "rows"
+    """rows: sample by sample; time: between its samples, by its time column, which is on the clock
+    of the trial's file; start: the same, both counted from their first sample"""
     time: str = Field(default="", description="Its time column, if not called as that of the file")
-    time_unit: TimeUnit | Literal[""] = Field(
-        default="", description="Unit of its time column, if not that of the file"
-    )
+    time_unit: TimeUnit | Literal[""] = ""
+    """Unit of its time column, if not that of the file"""
 
 
 class TrialEntry(NamedDeclaration):
     """One ``[[trials]]`` entry."""
 
     file: LogPath
-    part: str = Field(
-        default="", description="Where parts have columns of the same names, a name for this file"
-    )
-    parts: Several[Part] = Field(
-        default=(), description="Other files of the same recording, one entry each"
-    )
+    part: str = ""
+    """Where parts have columns of the same names, a name for this file"""
+    parts: Several[Part] = ()
+    """Other files of the same recording, one entry each"""
     recording: Annotated[int, Field(ge=1)] | None = Field(
         default=None,
         description="Which recording, where the file holds several: each begins with the header, or"
         " where time starts again",
     )
-    columns: dict[str, str] = Field(
-        default={},
-        description="Where several trials stand side by side in a file: its columns, by the names"
-        " that the tables give for the first of them",
-    )
-    kind: Literal["free", "locked", "viscous"] = Field(
-        description="free: moved at will; locked: a brake holds one axis; viscous: in a field"
-    )
-    locked_axis: ChannelName | None = Field(
-        default=None, description="The locked axis, of a locked trial"
-    )
-    viscous: Positive | None = Field(
-        default=None,
-        alias="viscous_n_s_per_m",
-        description="Commanded Cartesian damping, N.s/m, of a viscous trial",
-    )
-    start_s: NotNegative = Field(
-        default=0.0, description="Where in the record the trial starts, s after its first sample"
-    )
-    end_s: Positive = Field(
-        default=math.inf,
-        description="Where it ends, s after the first sample of the record; this moment excluded",
-    )
-    negated: Distinct[ChannelName] = Field(
-        default=(),
-        description="Axes, components of the force and channels that were logged with the other"
-        " sign in this trial",
-    )
+    columns: dict[str, str] = Field(default={})
+    """Where several trials stand side by side in a file: its columns, by the names that the tables
+    give for the first of them"""
+    kind: Literal["free", "locked", "viscous"]
+    """free: moved at will; locked: a brake holds one axis; viscous: in a field"""
+    locked_axis: ChannelName | None = None
+    """The locked axis, of a locked trial"""
+    viscous: Positive | None = Field(default=None, alias="viscous_n_s_per_m")
+    """Commanded Cartesian damping, N.s/m, of a viscous trial"""
+    start_s: NotNegative = 0.0
+    """Where in the record the trial starts, s after its first sample"""
+    end_s: Positive = math.inf
+    """Where it ends, s after the first sample of the record; this moment excluded"""
+    negated: Distinct[ChannelName] = ()
+    """Axes, components of the force and channels that were logged with the other sign in this
+    trial"""
     hold_out: bool = Field(default=False, description="Never fitted, only for judging models")
     notes: str = Field(default="", description="Free text")
 
@@ -253,32 +234,23 @@ class Session(Declaration):
     recorded_at: Annotated[str, BeforeValidator(_moment)] | None = Field(
         default=None, description="Date and time of the recording, ISO 8601"
     )
-    sample_rate: Positive = Field(
-        alias="sample_rate_hz", description="Nominal sample rate; the time column rules"
-    )
+    sample_rate: Positive = Field(alias="sample_rate_hz")
+    """Nominal sample rate; the time column rules"""
     notes: str = Field(default="", description="Free text")
     operator: str = Field(default="", description="Who recorded it")
     device_serial: str = Field(default="", description="Serial number of the device")
-    simulated: bool = Field(
-        default=False, description="Whether a simulator made it; the report then says so"
-    )
-    clock: Clock = Field(
-        default=Clock(column="time_us", unit="us"),
-        alias="time",
-        description="The time column, where it is not time_us in microseconds",
-    )
-    dialect: Dialect = Field(
-        default=Dialect(),
-        alias="csv",
-        description="Layout of text files, where it cannot be found in them",
-    )
+    simulated: bool = False
+    """Whether a simulator made it; the report then says so"""
+    clock: Clock = Field(default=Clock(column="time_us", unit="us"), alias="time")
+    """The time column, where it is not time_us in microseconds"""
+    dialect: Dialect = Field(default=Dialect(), alias="csv")
+    """Layout of text files, where it cannot be found in them"""
     encoders: Annotated[tuple[Encoder, ...], ByName(ChannelName, least=1)] = Field(
         description="One entry an axis"
     )
     force: Force | None = Field(default=None, description="Force sensor, or force of the motors")
-    brake_table: BrakeTable | None = Field(
-        default=None, alias="brakes", description="Commanded braking"
-    )
+    brake_table: BrakeTable | None = Field(default=None, alias="brakes")
+    """Commanded braking"""
     channels: Annotated[tuple[Channel, ...], ByName(ChannelName)] = Field(
         default=(), description="Any other recorded input"
     )
