@@ -50,13 +50,20 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
         for e, share in probabilities.effects.items()
     }
     where = {e: acting_axes(initial.recipe, e) for e in probability}
-    selected = tuple(e for e in selection.effects if probability.get(e, 0.0) >= 1.0 - c.probability)
-    axes = []
-    for axis in range(len(final.evidence.system.coordinates)):
+    axes = list[AxisVerdict]()
+    for number in range(len(final.evidence.system.coordinates)):
         likely = [(e, p) for e, p in probability.items() if p >= 1.0 - c.probability]
-        here = [pair for pair in likely if axis in where[pair[0]]]
+        here = [pair for pair in likely if number in where[pair[0]]]
         listed = dict(sorted(here, key=lambda pair: -pair[1]))
-        axes.append(_judge(session, selection, axis, listed))
+        axes.append(_judge(session, selection, number, listed))
+    # Beside something unknown, effects in doubt are added only where they lower the error.
+    helpful = {
+        effect
+        for axis in axes
+        for effect in axis.probabilities
+        if axis.verdict != "unknown_effect" or axis.rmse_after < axis.rmse_before
+    }
+    selected = tuple(effect for effect in selection.effects if effect in helpful)
     ranking = rank_effects(selection, probability, p_values, 1.0 - c.probability)
     return Conclusion(
         tuple(axes), selected, tuple(ranking), _list_sets(selection),
