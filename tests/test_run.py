@@ -41,6 +41,14 @@ def run_record(toy: Toy) -> dict[str, object]:
 # Cache
 
 
+@pytest.fixture
+def finished(toy: Toy) -> Toy:
+    """The toy after a first run."""
+    toy.run()
+    toy.ran()
+    return toy
+
+
 def test_all_stages_run_once_then_nothing(toy: Toy) -> None:
     assert states(toy.run()) == ["done"] * 4
     assert toy.ran() == ALL
@@ -62,56 +70,48 @@ def test_same_input_gives_same_bytes_and_record(toy: Toy) -> None:
     }
 
 
-def test_white_space_and_comments_in_toml_rerun_nothing(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
+def test_white_space_and_comments_in_toml_rerun_nothing(finished: Toy) -> None:
     for path in (
-        toy.session / "session.toml",
-        toy.pipeline_file,
-        toy.root / "models/base/model.toml",
+        finished.session / "session.toml",
+        finished.pipeline_file,
+        finished.root / "models/base/model.toml",
     ):
         path.write_text("# a comment\n\n" + path.read_text().replace(" = ", "   =  ") + "\n\n")
-    assert states(toy.run()) == ["unchanged"] * 4
-    assert toy.ran() == []
+    assert states(finished.run()) == ["unchanged"] * 4
+    assert finished.ran() == []
 
 
-def test_changed_trial_reruns_what_depends_on_it(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    (toy.session / "numbers.txt").write_text("1 2 4")
-    outcome = toy.run()
-    assert toy.ran() == ALL
+def test_changed_trial_reruns_what_depends_on_it(finished: Toy) -> None:
+    (finished.session / "numbers.txt").write_text("1 2 4")
+    outcome = finished.run()
+    assert finished.ran() == ALL
     assert outcome.steps[0].reason == "numbers.txt changed"
     assert outcome.steps[1].reason == "toy/numbers.json changed"
-    path = toy.session / "session.toml"
+    path = finished.session / "session.toml"
     path.write_text(path.read_text() + 'note = "new"\n')
-    outcome = toy.run()
+    outcome = finished.run()
     assert outcome.steps[0].reason == "session.toml changed"
     assert states(outcome) == ["done", "unchanged", "unchanged", "unchanged"]
-    assert (toy.root / "toy/parts/2.json").exists()
-    (toy.session / "numbers.txt").write_text("1 2")
-    toy.run()
-    assert not (toy.root / "toy/parts/2.json").exists(), "fewer outputs leave no stale files"
+    assert (finished.root / "toy/parts/2.json").exists()
+    (finished.session / "numbers.txt").write_text("1 2")
+    finished.run()
+    assert not (finished.root / "toy/parts/2.json").exists(), "fewer outputs leave no stale files"
 
 
-def test_changed_setting_reruns_from_there(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    outcome = toy.run(settings={"toy_double": {"factor": 3}})
-    assert toy.ran() == ALL[1:]
+def test_changed_setting_reruns_from_there(finished: Toy) -> None:
+    outcome = finished.run(settings={"toy_double": {"factor": 3}})
+    assert finished.ran() == ALL[1:]
     assert outcome.steps[1].reason == "settings changed"
-    toy.run(settings={"toy_double": {"factor": 3.0}})
-    assert toy.ran() == [], "3 and 3.0 are the same factor"
-    toy.run(settings={"toy_double": {"factor": 3.0, "label": "new"}})
-    assert toy.ran() == ["toy_double"], "its outputs are the same bytes"
+    finished.run(settings={"toy_double": {"factor": 3.0}})
+    assert finished.ran() == [], "3 and 3.0 are the same factor"
+    finished.run(settings={"toy_double": {"factor": 3.0, "label": "new"}})
+    assert finished.ran() == ["toy_double"], "its outputs are the same bytes"
 
 
 @pytest.mark.parametrize("damage", ["change", "truncate", "remove"])
-def test_damaged_output_is_noticed_named_and_rebuilt(toy: Toy, damage: str) -> None:
-    toy.run()
-    toy.ran()
-    good = toy.files()
-    path = toy.root / "toy/double.json"
+def test_damaged_output_is_noticed_named_and_rebuilt(finished: Toy, damage: str) -> None:
+    good = finished.files()
+    path = finished.root / "toy/double.json"
     if damage == "remove":
         path.unlink()
     else:
@@ -120,21 +120,19 @@ def test_damaged_output_is_noticed_named_and_rebuilt(toy: Toy, damage: str) -> N
         changed = content.replace(b"2", b"7") if damage == "change" else content[:10]
         path.write_bytes(changed)
         os.utime(path, ns=(keep.st_atime_ns, keep.st_mtime_ns))
-    outcome = toy.run()
+    outcome = finished.run()
     assert "toy/double.json" in outcome.steps[1].reason
-    assert toy.ran() == ["toy_double"]
-    assert toy.files() == good
+    assert finished.ran() == ["toy_double"]
+    assert finished.files() == good
 
 
-def test_from_takes_what_is_before_as_it_stands_unless_tampered_with(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    (toy.session / "numbers.txt").write_text("5")
-    assert states(toy.run(first="toy_double")) == ["unchanged"] * 3
-    assert toy.ran() == []
-    (toy.root / "toy/numbers.json").write_text('{"numbers": [9]}')
+def test_from_takes_what_is_before_as_it_stands_unless_tampered_with(finished: Toy) -> None:
+    (finished.session / "numbers.txt").write_text("5")
+    assert states(finished.run(first="toy_double")) == ["unchanged"] * 3
+    assert finished.ran() == []
+    (finished.root / "toy/numbers.json").write_text('{"numbers": [9]}')
     with pytest.raises(InputError, match=r"toy/numbers\.json was changed since toy_read wrote it"):
-        toy.run(first="toy_double")
+        finished.run(first="toy_double")
 
 
 def test_a_stage_asked_for_too_early_is_no_failure_of_the_run(toy: Toy) -> None:
@@ -273,23 +271,21 @@ def add_child(toy: Toy) -> str:
     return name
 
 
-def test_children_are_refreshed_once_they_were_run(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    name = add_child(toy)
+def test_children_are_refreshed_once_they_were_run(finished: Toy) -> None:
+    name = add_child(finished)
     assert name == "base+stribeck.yaw"
     many = tuple(f"position_dependent_friction:axis_{k}" for k in range(9))
     assert models.child_name(name, many).startswith(f"{name}+9_effects_")
-    toy.run()
-    assert toy.ran() == [], "nobody has asked for the child yet"
-    toy.run(first="toy_fit", last="toy_fit", model=name, judge=False)
-    assert toy.ran() == [f"toy_fit:{name}"]
-    toy.run()
-    assert toy.ran() == ["toy_sum"]
-    (toy.session / "numbers.txt").write_text("2 3")
-    toy.run()
-    assert toy.ran() == [*ALL[:3], f"toy_fit:{name}", "toy_sum"]
-    assert models.read(toy.root, name).effects == ("stribeck:yaw",)
+    finished.run()
+    assert finished.ran() == [], "nobody has asked for the child yet"
+    finished.run(first="toy_fit", last="toy_fit", model=name, judge=False)
+    assert finished.ran() == [f"toy_fit:{name}"]
+    finished.run()
+    assert finished.ran() == ["toy_sum"]
+    (finished.session / "numbers.txt").write_text("2 3")
+    finished.run()
+    assert finished.ran() == [*ALL[:3], f"toy_fit:{name}", "toy_sum"]
+    assert models.read(finished.root, name).effects == ("stribeck:yaw",)
 
 
 def test_gates_judge_the_best_confirmed_model_and_its_stages_run(toy: Toy) -> None:
@@ -311,13 +307,11 @@ def test_gates_judge_the_best_confirmed_model_and_its_stages_run(toy: Toy) -> No
     assert toy.run(model="base").model == "base"
 
 
-def test_a_new_effect_file_reruns_its_model(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    (toy.root / "models/base/effects").mkdir()
-    (toy.root / "models/base/effects/own.toml").write_text('name = "own"\n')
-    toy.run()
-    assert toy.ran() == ["toy_fit:base"]
+def test_a_new_effect_file_reruns_its_model(finished: Toy) -> None:
+    (finished.root / "models/base/effects").mkdir()
+    (finished.root / "models/base/effects/own.toml").write_text('name = "own"\n')
+    finished.run()
+    assert finished.ran() == ["toy_fit:base"]
 
 
 # Provenance

@@ -17,9 +17,8 @@ _SLOWEST_HZ = 100.0
 """A sensor's own low-pass correlates the noise of neighbouring samples, which still acts at the
 frequencies of the motion. A record thinned to this rate shows that noise."""
 _NORMAL_MEDIAN = 0.6744897501960817
-_CLIP, _CLIPPED_POWER, _CLIPPINGS = 2.0, 0.920536925636323, 8
-"""Standard deviations at which differences are clipped, where outliers raise their mean square no
-more than their median; the mean square of a normal variable clipped so; and iterations."""
+_AGREE = 3.0
+"""Two standard errors of the ratio of the noise by two orders, times the root of the samples."""
 _CUT = 2.0
 """Multiple of the 90 % quantile of the magnitudes at which larger differences are clipped: 3.3
 standard deviations of a normal distribution."""
@@ -39,8 +38,8 @@ def white_noise_sd(
 ) -> float:
     """Standard deviation of the white noise in a record (T,) of a signal that is otherwise smooth.
 
-    It comes from clipped differences (Huber 1981, Robust Statistics, section 5.2), robust against
-    spikes and steps. It is NaN for records that are too short.
+    It comes from the median absolute difference, which is robust against spikes and steps. It is
+    NaN for records that are too short.
 
     Args:
         record: samples.
@@ -107,7 +106,11 @@ def _without_dither(noise: float, step: float) -> float:
 
 
 def _difference_noise(record: Array, t: Array | None, pulsed: bool = False) -> float:
-    """Return the smallest noise that differences of several orders of a record show."""
+    """Return the smallest noise that differences of several orders of a record show.
+
+    Of orders that agree, it is that of the lowest, whose median scatters least: the smallest of
+    several medians of white noise would lie below it.
+    """
     if record.size < _FEWEST:
         return float("nan")
     if record.size > _STRETCHES * _STRETCH:
@@ -130,19 +133,12 @@ def _difference_noise(record: Array, t: Array | None, pulsed: bool = False) -> f
         if order < _LOWEST_ORDER:
             continue
         size = np.abs(differences) / np.sqrt(np.sum(weights**2, axis=0))
-        typical = _cut_rms(size) if pulsed else _clipped_sd(size)
+        typical = _cut_rms(size) if pulsed else float(np.median(size)) / _NORMAL_MEDIAN
         if typical == 0.0:  # more than half the differences are zero: coarse steps
             typical = float(np.sqrt(np.mean(np.square(size))))
         found.append(typical)
-    return float(min(found))
-
-
-def _clipped_sd(size: Array) -> float:
-    """Return the standard deviation of normal noise by its magnitudes (n,), a few of them wild."""
-    sd = float(np.median(size)) / _NORMAL_MEDIAN
-    for _ in range(_CLIPPINGS):
-        sd = float(np.sqrt(np.mean(np.minimum(size, _CLIP * sd) ** 2) / _CLIPPED_POWER))
-    return sd
+    agreed = (1.0 + _AGREE / np.sqrt(record.size)) * min(found)
+    return float(next(noise for noise in found if noise <= agreed))
 
 
 def _cut_rms(size: Array) -> float:

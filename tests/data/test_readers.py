@@ -38,12 +38,6 @@ def as_csv(table):
     return pd.DataFrame(table).to_csv(index=False).encode()
 
 
-def as_parquet(table):
-    stream = io.BytesIO()
-    pd.DataFrame(table).to_parquet(stream)
-    return stream.getvalue()
-
-
 def as_mat(table, **options):
     stream = io.BytesIO()
     scipy.io.savemat(stream, table, **options)
@@ -61,7 +55,7 @@ def as_mat73(table, userblock=512):
 
 WHOLE = {
     "a.csv": as_csv(TABLE),
-    "b.parquet": as_parquet(TABLE),
+    "b.parquet": pd.DataFrame(TABLE).to_parquet(),
     "c.mat": as_mat(TABLE),
     "d.mat": as_mat(TABLE, do_compression=True),
     "e.mat": as_mat73(TABLE),
@@ -74,8 +68,8 @@ WHOLE = {
         ("a.csv", as_csv(TABLE)),
         ("A.CSV", as_csv(TABLE)),
         ("a.csv.gz", gzip.compress(as_csv(TABLE))),
-        ("a.parquet", as_parquet(TABLE)),
-        ("a.parquet", as_parquet(pd.DataFrame(TABLE).astype("float32"))),
+        ("a.parquet", pd.DataFrame(TABLE).to_parquet()),
+        ("a.parquet", pd.DataFrame(TABLE).astype("float32").to_parquet()),
         ("a.mat", as_mat(TABLE, oned_as="row")),
         ("a.mat", as_mat(TABLE, oned_as="column", do_compression=True)),
         ("a.mat", as_mat73(TABLE)),
@@ -97,7 +91,7 @@ def test_empty_cells_and_words_for_missing_are_nan(tmp_path):
     np.testing.assert_array_equal(columns["a"], [1, np.nan, np.nan, np.nan, 5])
     np.testing.assert_array_equal(columns["b"], [np.nan, 2, np.nan, np.inf, 6])
     table = pd.DataFrame({"a": pa.array([1, None, 3]).to_pandas(), "b": [1, 2, 3]})
-    columns = read(tmp_path / "a.parquet", as_parquet(table), ("a", "b")).columns
+    columns = read(tmp_path / "a.parquet", table.to_parquet(), ("a", "b")).columns
     np.testing.assert_array_equal(columns["a"], [1, np.nan, 3])
 
 
@@ -105,7 +99,8 @@ def test_many_blocks_are_joined_in_order(tmp_path, monkeypatch):
     monkeypatch.setattr(text_reader, "BLOCK", 1024)
     monkeypatch.setattr(parquet, "BATCH_ROWS", 100)
     table = {"a": np.arange(5000), "b": np.arange(5000) * 0.5}
-    for name, content in (("a.csv", as_csv(table)), ("a.parquet", as_parquet(table))):
+    files = {"a.csv": as_csv(table), "a.parquet": pd.DataFrame(table).to_parquet()}
+    for name, content in files.items():
         columns = read(tmp_path / name, content, ("b", "a")).columns
         np.testing.assert_array_equal(columns["a"], table["a"])
         np.testing.assert_array_equal(columns["b"], table["b"])

@@ -46,11 +46,10 @@ def test_a_fast_signal_or_a_smoothing_sensor_is_told_from_noise():
 
 def test_the_noise_of_short_trials_is_not_underestimated():
     rng, t = np.random.default_rng(5), np.arange(900) / 90.0
-    found = [
-        settle_force("force", "N", None, [RecordNoise.of(rng.normal(size=900), t) for _ in "four"])
-        for _ in range(25)
-    ]
-    assert np.mean([noise.noise_sd for noise in found]) == pytest.approx(1.0, abs=0.015)
+    trials = [RecordNoise.of(rng.normal(size=900), t) for _ in range(100)]
+    sessions = [trials[k : k + 4] for k in range(0, 100, 4)]
+    found = [settle_force("force", "N", None, session).noise_sd for session in sessions]
+    assert np.mean(found) == pytest.approx(1.0, abs=0.015)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.4, 0.8, 2.0])
