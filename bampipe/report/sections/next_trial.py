@@ -20,11 +20,8 @@ def list_blocks(results: Results) -> Iterator[Block]:
         return
     yield Callout("note", "The next trial", found.sentence)
     yield Paragraph(f"{found.why} {found.expected}")
-    forecasts, identified = (
-        read_forecasts(results.root, results.model),
-        results.read(IdentifyResult),
-    )
-    if identified is not None:
+    if identified := results.read(IdentifyResult):
+        forecasts = read_forecasts(results.root, results.model)
         lines = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
         if lines:
             yield Bullets(tuple(one.replace("RUN", results.root.name) for one in lines))
