@@ -120,7 +120,6 @@ def _log_scale_with_filters(
         scale = float(np.mean(y[axis] ** 2))
         rows = likelihood.log_of_filter(axis, gains[axis], scale)
         value[axis] += rows.mean()
-        # The slope of the logarithm by the gain, from the logarithm itself.
         more = likelihood.log_of_filter(axis, gains[axis] * (1.0 + 1e-6), scale)
         slopes[axis] += (more - rows).mean() / (1e-6 * gains[axis]) * by_parameter[axis]
     return value, slopes

@@ -172,12 +172,13 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
 
 
 def _least_typical(values: Sequence[float]) -> float | None:
-    """Root mean square of what does not exceed the lower quartile by more than chance would."""
+    """Root mean square of what differs from the lower quartile by no more than chance would."""
     finite = np.array([value for value in values if np.isfinite(value)])
     if not finite.size:
         return None
-    alike = finite[finite <= _ALIKE * np.quantile(finite, 0.25)]
-    return float(np.sqrt(np.mean(alike**2)))
+    quartile = float(np.quantile(finite, 0.25))
+    alike = (finite <= _ALIKE * quartile) & (_ALIKE * finite >= quartile)
+    return float(np.sqrt(np.mean(finite[alike] ** 2))) if alike.any() else quartile
 
 
 @dataclass(frozen=True)
