@@ -35,8 +35,7 @@ class Candidate:
     @property
     def takes_timing(self) -> bool:
         """Whether the effect delays every measured force."""
-        delayed = any(q.name in self.system.delays for q in self.parameters)
-        return delayed and self.system.takes_timing
+        return self.name in self.system.timing_effects
 
     @property
     def replaces_motion(self) -> bool:

@@ -84,12 +84,6 @@ class SetCosts:
         self.applied = [max(float(f @ f), 1e-300) for f in problem.likelihood.applied]
         # Columns that take part of the measured force scale or filter its noise, too.
         self._moves_noise = True
-        own = dictionary.evidence.system
-        self._own_delays = {
-            item.name
-            for item in own.model.effects
-            if own.takes_timing and any(q.name in own.delays for q in item.parameters)
-        }
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
         self.ensure(grid)
         places = {key: atom for key in grid if (atom := self.atoms[key]) is not None}
@@ -195,7 +189,8 @@ class SetCosts:
         delays = sum(self.dictionary.candidates[name].takes_timing for name, _ in keys)
         if delays:
             absent |= p.no_delay
-        delays += bool(self._own_delays.difference(removed_effects(all_keys)))
+        present = self.dictionary.evidence.system.timing_effects
+        delays += bool(present.difference(removed_effects(all_keys)))
         if delays > 1 or any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
         xx, xy, places = self._sums(keys)

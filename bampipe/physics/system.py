@@ -97,6 +97,13 @@ class System:
         return self._delayed == {*self.model.device.forces}
 
     @cached_property
+    def timing_effects(self) -> frozenset[str]:
+        """Names of the effects that together delay every measured force; none if some stay."""
+        late = {*self.delays}
+        named = [e.name for e in self.model.effects if late & {p.name for p in e.parameters}]
+        return frozenset(named if self.takes_timing else ())
+
+    @cached_property
     def _delayed(self) -> set[str]:
         """The measured forces of which a delay is estimated."""
         device, results = self.model.device, set[str]()

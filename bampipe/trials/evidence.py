@@ -156,10 +156,9 @@ class Evidence:
         before = self.spectra_of(self.system, without)
         gain = gain_of_filter(before, self.spectra_of(self.system, self.p), self.band)
         for number in {*strengths} & {*self.free}:
-            longer = self.p.copy()
-            longer[number] *= 1.0 + _STEP
+            longer, change = self.p.copy(), max(_STEP * self.p[number], 1e-300)
+            longer[number] += change
             there = gain_of_filter(before, self.spectra_of(self.system, longer), self.band)
-            change = max(longer[number] - self.p[number], 1e-300)
             slopes[:, self.free.index(number)] = (there - gain) / change
         return gain, slopes
 

@@ -162,8 +162,8 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
     pulses = [r.white_sd for r in records if r.pulsed]
     if 2 * len(pulses) > len(records):
         return float(np.sqrt(np.mean(np.square(pulses))))
-    white = _least_typical([record.white_sd for record in records])
-    slow = _least_typical([record.slow_sd for record in records])
+    white = _agreed_noise([record.white_sd for record in records])
+    slow = _agreed_noise([record.slow_sd for record in records])
     if white is None or slow is None or slow <= _COLOURED * white:
         return white
     if stated and stated**2 < white * slow:
@@ -171,7 +171,7 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
     return slow
 
 
-def _least_typical(values: Sequence[float]) -> float | None:
+def _agreed_noise(values: Sequence[float]) -> float | None:
     """Root mean square of what differs from the lower quartile by no more than chance would."""
     finite = np.array([value for value in values if np.isfinite(value)])
     if not finite.size:

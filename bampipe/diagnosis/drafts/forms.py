@@ -160,7 +160,7 @@ class Form:
         scale: highest speed or acceleration of the axis if that is the factor, else 1.
         other_quantities: further quantities, ``x2``, ``x3`` in the shape, and their ranges.
         prefix: prefix of its name if a model has two terms of one form.
-        takes_timing: as of a `Candidate`; no form delays a force.
+        takes_timing: always false, since no form delays a force.
     """
 
     axis: Axis
