@@ -29,8 +29,6 @@ class Criteria:
         tails: degrees of freedom of Student's t distribution of the errors.
         block_s: length of independent blocks of time, s; no single block decides a verdict.
         beam: number of sets of effects that are pursued side by side.
-        doubt: scale of the residual of an axis, in units of noise and discrepancy, above which
-            something unknown is certain.
     """
 
     probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.9
@@ -43,7 +41,6 @@ class Criteria:
     tails: Positive = 4.0
     block_s: Positive = 2.0
     beam: Annotated[int, Field(ge=1)] = 10
-    doubt: Positive = 3.0
 
     @property
     def largest_p_value(self) -> float:

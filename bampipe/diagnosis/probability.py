@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logit, softmax
+from scipy.special import logit, ndtr, softmax
 
 from bampipe.arrays import Array, Flags
 from bampipe.diagnosis.criteria import Criteria
@@ -140,8 +140,7 @@ def weigh_sets(
                 drops[effect] = _find_evidence_losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
-    far = np.sqrt(_sum_squares(costs, ()) / np.maximum(costs.problem.count, 1)) > criteria.doubt
-    unknown[far] = 1.0
+    unknown = np.maximum(unknown, _compute_excess(costs))
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
     for effect in own if doubtful.any() else ():
         # A doubtful effect is not absent: the model keeps it, and the report mentions it.
@@ -153,6 +152,16 @@ def weigh_sets(
 def _sum_squares(costs: SetCosts, keys: tuple[Key, ...]) -> Array:
     """Return the sum of squares of the residual of a set in units of the noise, (n_q,)."""
     return np.array([max(float(rows @ rows), 1e-300) for rows in costs.residual_rows(keys)])
+
+
+def _compute_excess(costs: SetCosts) -> Array:
+    """Return the probability that the residual of each axis exceeds noise and discrepancy, (n_q,).
+
+    With flat prior and N independent samples, log s is normal with variance 1/(2 N).
+    """
+    p = costs.problem
+    log_scale = 0.5 * np.log(_sum_squares(costs, ()) / np.maximum(p.count, 1))
+    return np.asarray(ndtr(log_scale * np.sqrt(2.0 * p.independent)))
 
 
 def _share_explained(costs: SetCosts, effect: str, far: Flags) -> float:
