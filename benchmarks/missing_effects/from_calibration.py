@@ -1,7 +1,7 @@
 """The entry of bampipe, from the scores that a calibration has stored.
 
     cd benchmarks
-    python calibration.py --hidden 300 --clean 150 --first-seed 100001 --out SCORES.jsonl
+    python calibration.py --hidden 300 --clean 150 --first-seed 120001 --out SCORES.jsonl
     python -m missing_effects.from_calibration SCORES.jsonl --out ENTRY.jsonl
 
 The calibration draws the same sessions from the same seeds, and diagnoses each bare model.

@@ -11,9 +11,9 @@ from pathlib import Path
 from independent import MACHINES
 from independent.draws import draw_session
 
-VERSION = "6.0"
+VERSION = "7.0"
 TABLE = Path(__file__).with_name("recipes.tsv")
-PARTS = {"development": 50001, "test": 100001}
+PARTS = {"development": 50001, "test": 120001}
 """First seed of each part."""
 HIDDEN, CLEAN = 300, 150
 """Sessions of a part, with and without something hidden."""
