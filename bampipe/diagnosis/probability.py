@@ -140,7 +140,9 @@ def weigh_sets(
                 drops[effect] = _find_evidence_losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
-    unknown = np.maximum(unknown, _compute_excess(costs))
+    excess = _compute_excess(costs)
+    sets = _add_unknown(sets, int(np.argmax(excess)), float(excess.max()))
+    unknown = np.maximum(unknown, excess)
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
     for effect in own if doubtful.any() else ():
         # A doubtful effect is not absent: the model keeps it, and the report mentions it.
@@ -162,6 +164,23 @@ def _compute_excess(costs: SetCosts) -> Array:
     p = costs.problem
     log_scale = 0.5 * np.log(_sum_squares(costs, ()) / np.maximum(p.count, 1))
     return np.asarray(ndtr(log_scale * np.sqrt(2.0 * p.independent)))
+
+
+def _add_unknown(sets: Sequence[SetEvidence], axis: int, least: float) -> tuple[SetEvidence, ...]:
+    """Return the sets where something unknown has at least the probability ``least``.
+
+    Of its form nothing is known, so that it is as probable on ``axis`` beside any set without it.
+    """
+    none = sum(s.probability for s in sets if s.unknown is None)
+    share = max(0.0, 1.0 - (1.0 - least) / max(none, 1e-300))
+    beside = {s.effects: s for s in sets if s.unknown == axis}
+    rest = [s for s in sets if s.unknown not in (None, axis)]
+    for one in (s for s in sets if s.unknown is None):
+        same = beside.get(one.effects, replace(one, unknown=axis, probability=0.0))
+        more = same.probability + share * one.probability
+        beside[one.effects] = replace(same, probability=more)
+        rest.append(replace(one, probability=(1.0 - share) * one.probability))
+    return tuple(sorted([*rest, *beside.values()], key=lambda s: -s.probability))
 
 
 def _share_explained(costs: SetCosts, effect: str, far: Flags) -> float:

@@ -173,6 +173,7 @@ def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, eff
     axis, (_, found) = 0, diagnose_trials(*record(machine, 12, effect))
     here = found.axes[axis]
     assert here.verdict == "unknown_effect" and here.remains and here.unknown > 0.9
+    assert sum(one.probability for one in found.sets if one.unknown is not None) > 0.9
     assert {*here.effects, *found.selected} <= doubt
     assert max(here.probabilities.values(), default=0.0) < 0.9
     assert {v for k, v in enumerate(verdicts(found)) if k != axis} <= {"nothing_missing"}
