@@ -271,11 +271,3 @@ def test_the_static_tables_agree_with_the_stages(name: str) -> None:
     fields = set(module.Config.__dataclass_fields__)
     assert ("model" in fields) == (name in base.PER_MODEL)
     assert ("session" in fields) == (name in base.READS_SESSION)
-
-
-@pytest.mark.parametrize("name", base.STAGES)
-def test_every_setting_is_described(name: str) -> None:
-    config = base.load_stage(name).Config
-    text = "".join(cls.__doc__ or "" for cls in config.__mro__[:-1])
-    for field in config.__dataclass_fields__:
-        assert field in text, f"{name}: {field}"

@@ -239,6 +239,9 @@ def test_the_layout_that_a_session_declares(tmp_path):
         ("oz-in", "N.m", 7.0615518e-3), ("ft-lb", "N.m", 1.3558179), ("rad s^-1", "rad/s", 1.0),
         ("degrees per second", "rad/s", np.pi / 180), ("m·s⁻²", "m/s2", 1.0),
         ("0.229rpm", "rad/s", 0.229 * np.pi / 30), ("deg/10", "rad", np.pi / 1800),
+        ("U/min", "rad/s", np.pi / 30), ("gon", "rad", np.pi / 200), ("daN", "N", 10.0),
+        ("grados", "rad", np.pi / 180), ("10^-3 s", "s", 1e-3), ("NM", "N.m", 1.0),
+        ("N・m", "N.m", 1.0),
     ],
 )  # fmt: skip
 def test_units_of_logs(text, si, scale):
