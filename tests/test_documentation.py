@@ -14,12 +14,6 @@ ROOT = Path(__file__).parent.parent
 DOCS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def blocks(name, language="toml"):
-    """Fenced blocks of one document."""
-    text = (ROOT / "docs" / name).read_text(encoding="utf-8")
-    return re.findall(rf"```{language}\n(.*?)```", text, re.S)
-
-
 def test_all_functions_are_listed():
     text = (ROOT / "docs/effects.md").read_text(encoding="utf-8")
     listed = re.search(r"^ {4}(sin .*)$", text, re.M)

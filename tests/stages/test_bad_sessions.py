@@ -3,9 +3,10 @@
 Each case damages a small sound session in one way and states what ingest must say: the whole
 session is refused (one line, nothing written), one trial is set aside with a reason while the
 others are kept, or the trial is repaired and the repair is said. The first two are tried as a user
-meets them, in `test_bad_sessions_cli.py`.
+meets them: exit code, one line, nothing left behind.
 """
 
+import json
 import re
 from collections.abc import Callable
 from functools import reduce
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Command
 from made_session import COLUMNS, Made, free_trial, locked_trial, parquet
 
 from bampipe.data.run_folder import RunFolder
@@ -27,13 +29,19 @@ T01 = "trials/t01.csv"
 Damage = Callable[[Made], Callable[[Path], None] | None]
 
 
-def run_ingest(made: Made, root: Path, damage: Damage | None = None, **settings: object):
-    """Ingest a damaged session; returns the trials table by id, and the output folder."""
-    after = damage(made) if damage is not None else None
-    session, out = root / "session", root / "out"
+def make(damage: Damage, session: Path, made: Made | None = None) -> Path:
+    """Write a damaged session."""
+    made = made or Made()
+    after = damage(made)
     made.write(session)
     if after is not None:
         after(session)
+    return session
+
+
+def run_ingest(made: Made, root: Path, damage: Damage = lambda made: None, **settings: object):
+    """Ingest a damaged session; returns the trials table by id, and the output folder."""
+    session, out = make(damage, root / "session", made), root / "out"
     out.mkdir()
     config = ingest.Config(session=str(session), **settings)
     ingest.execute(RunFolder(out), out, config, silent)
@@ -424,6 +432,69 @@ SOUND: dict[str, tuple[Damage, str]] = {
     ),
     "negative counts per unit": (put("encoders.yaw.counts_per_unit", -21333.3333), ""),
 }
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_session_is_refused_by_a_line_a_fault(
+    name: str, tmp_path: Path, command: Command
+) -> None:
+    damage, message = REFUSED[name]
+    session = make(damage, tmp_path / "session")
+    code, out, err = command("ingest", session, "--runs", tmp_path / "runs")
+    assert (code, out) == (2, "")
+    lines = [line for line in err.splitlines() if line.startswith("bampipe: error: ")]
+    assert lines and err.endswith("\n".join(lines) + "\n") and "Traceback" not in err, err
+    assert all(str(session) in line for line in lines), "a line a fault"
+    assert re.search(message, err)
+    assert not list((tmp_path / "runs").glob("*")), "a refused session leaves no run folder"
+
+
+@pytest.mark.parametrize("name", ASIDE)
+def test_a_trial_is_set_aside_in_one_line(name: str, tmp_path: Path, command: Command) -> None:
+    damage, message = ASIDE[name]
+    session = make(damage, tmp_path / "session")
+    code, out, err = command("ingest", session, "--runs", tmp_path / "runs", "--quiet")
+    assert (code, err) == (0, "")
+    assert "3 trials: 2 sound, 1 set aside" in out
+    (line,) = [line for line in out.splitlines() if line.startswith("set aside: ")]
+    assert line.startswith("set aside: t01: trials/t01.")
+    assert re.search(message, line.removeprefix("set aside: t01: ")), line
+    (samples,) = (tmp_path / "runs").glob("*/ingest/samples.parquet")
+    assert set(read_parquet(samples).trial_id) == {"t02", "t03"}
+
+
+def test_a_repair_is_said_in_one_line(tmp_path: Path, command: Command) -> None:
+    damage, message = REPAIRED["a few NaN"]
+    session = make(damage, tmp_path / "session")
+    code, out, err = command("ingest", session, "--runs", tmp_path / "runs", "--quiet")
+    assert (code, err) == (0, "")
+    (line,) = [line for line in out.splitlines() if line.startswith("note: t01: ")]
+    assert re.search(message, line), line
+
+
+def test_a_refused_session_leaves_earlier_results_as_they_were(
+    tmp_path: Path, command: Command
+) -> None:
+    session = make(lambda made: None, tmp_path / "session")
+    assert command("ingest", session, "--runs", tmp_path / "runs")[0] == 0
+    (root,) = (tmp_path / "runs").glob("*")
+    before = {path: path.read_bytes() for path in root.rglob("*.parquet")}
+    text = (session / "session.toml").read_text()
+    (session / "session.toml").write_text(text.replace("session/1", "session/9"))
+    code, _, err = command("ingest", session, "--runs", tmp_path / "runs", "--quiet")
+    assert code == 2 and err.count("\n") == 1 and "session/9" in err
+    assert before and {path: path.read_bytes() for path in root.rglob("*.parquet")} == before
+
+
+def test_a_byte_order_mark_hides_no_change(tmp_path: Path, command: Command) -> None:
+    """A session file saved by an editor that puts a mark first: its trials are watched too."""
+    session = make(lambda made: None, tmp_path / "session")
+    path = session / "session.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    arguments = ("ingest", session, "--runs", tmp_path / "runs", "--json", "--quiet")
+    assert json.loads(command(*arguments)[1])["set_aside"] == []
+    (session / T01).write_text("")
+    assert [row["trial_id"] for row in json.loads(command(*arguments)[1])["set_aside"]] == ["t01"]
 
 
 def test_all_that_is_wrong_is_said_at_once_and_each_reason_once(tmp_path):

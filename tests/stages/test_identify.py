@@ -1,4 +1,4 @@
-"""The identify stage on simulated and shared sessions."""
+"""The identify stage on simulated sessions."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import schema_misfits
-from identified_run import MODEL, RESOLUTION, TRUTH, session_truth, shared_run, simulated_run
+from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
@@ -53,18 +53,6 @@ def assert_recovered(content: dict, truth: dict[str, float]) -> None:
     for name, value in truth.items():
         estimate = content["parameters"][name]["estimate"]
         assert estimate == pytest.approx(value, rel=TOLERANCE[name.split(".")[0]]), name
-
-
-@pytest.mark.parametrize("name", ["open-01", pytest.param("open-09", marks=pytest.mark.long)])
-def test_shared_sessions_within_what_is_asked(tmp_path: Path, name: str) -> None:
-    run = shared_run(tmp_path / name, name)
-    content = identified(run)
-    assert_recovered(content, session_truth(name))
-    assert content["convergence"]["converged"]
-    assert 0.7 < content["nis"]["mean"] < 1.4
-    for name_, value in session_truth(name).items():
-        entry = content["parameters"][name_]
-        assert abs(entry["estimate"] - value) < 6.0 * entry["sd"], name_
 
 
 def test_intervals_hold_on_a_simulated_session(published: tuple[Path, dict]) -> None:

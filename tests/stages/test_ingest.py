@@ -14,7 +14,6 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 from made_session import COUNTS, SESSION, Made, free_trial, parquet, toml_text
-from run_folders import SESSIONS
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
@@ -25,27 +24,12 @@ from bampipe.run.settings import configure
 from bampipe.stages import ingest
 
 SAMPLES = Path(__file__).parents[2] / "sample_runs"
-NAMES = ["open-01", *(pytest.param(f"open-0{k}", marks=pytest.mark.long) for k in range(2, 10))]
 
 
 def run_ingest(session: Path, out: Path, **settings: object):
     out.mkdir(exist_ok=True)
     config = ingest.Config(session=str(session), **settings)
     return ingest.execute(RunFolder(out), out, config, silent)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_shared_session_is_sound(name, tmp_path):
-    if not (SESSIONS / name).is_dir():
-        pytest.skip(f"{SESSIONS / name} is not here")
-    summary = run_ingest(SESSIONS / name, tmp_path / "out")
-    trials = read_parquet(tmp_path / "out/ingest/trials.parquet")
-    assert (trials.status == "ok").all() and (trials.repairs == "").all()
-    assert summary["trials"] == {"ok": len(trials), "repaired": 0, "set_aside": 0}
-    np.testing.assert_allclose(trials.sample_rate_hz, 500.0)
-    samples = pq.ParquetFile(tmp_path / "out/ingest/samples.parquet")
-    assert samples.num_row_groups == len(trials)
-    assert samples.metadata.num_rows == trials.n_samples.sum()
 
 
 def test_samples_are_the_raw_columns_in_si_units_with_what_later_stages_need(tmp_path):
@@ -262,10 +246,10 @@ def test_memory_stays_below_three_times_the_largest_trial(tmp_path):
     table["time_us"][1000::2000] = table["time_us"][999::2000]
     raw = sum(column.nbytes for column in table.values())
     made = small.write(tmp_path / "small"), large.write(tmp_path / "large")
-    for trial in large.session["trials"][:2]:
-        with open(made[1] / trial["file"], "wb") as stream:
-            pa.csv.write_csv(pa.table(table), stream)
-    session = large.session | {"trials": [large.session["trials"][0]]}
+    first = large.session["trials"][0]
+    with open(made[1] / first["file"], "wb") as stream:
+        pa.csv.write_csv(pa.table(table), stream)
+    session = large.session | {"trials": [first]}
     (made[1] / "session.toml").write_text(toml_text(session))
     result = subprocess.run(
         [sys.executable, "-c", MEASURE, *map(str, made)],
