@@ -68,7 +68,7 @@ def plant(
     return folder
 
 
-@pytest.mark.parametrize("name", ["run.json", ".bampipe/staging", "toy"])
+@pytest.mark.parametrize("name", ["run.json", ".bampipe/lock", ".bampipe/staging", "toy"])
 def test_a_folder_for_a_file_or_a_file_for_a_folder_is_one_line_or_mended(
     toy: Toy, outside: Path, command: Command, name: str
 ) -> None:

@@ -472,20 +472,6 @@ def test_a_repair_is_said_in_one_line(tmp_path: Path, command: Command) -> None:
     assert re.search(message, line), line
 
 
-def test_a_refused_session_leaves_earlier_results_as_they_were(
-    tmp_path: Path, command: Command
-) -> None:
-    session = make(lambda made: None, tmp_path / "session")
-    assert command("ingest", session, "--runs", tmp_path / "runs")[0] == 0
-    (root,) = (tmp_path / "runs").glob("*")
-    before = {path: path.read_bytes() for path in root.rglob("*.parquet")}
-    text = (session / "session.toml").read_text()
-    (session / "session.toml").write_text(text.replace("session/1", "session/9"))
-    code, _, err = command("ingest", session, "--runs", tmp_path / "runs", "--quiet")
-    assert code == 2 and err.count("\n") == 1 and "session/9" in err
-    assert before and {path: path.read_bytes() for path in root.rglob("*.parquet")} == before
-
-
 def test_a_byte_order_mark_hides_no_change(tmp_path: Path, command: Command) -> None:
     """A session file saved by an editor that puts a mark first: its trials are watched too."""
     session = make(lambda made: None, tmp_path / "session")
