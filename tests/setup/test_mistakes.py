@@ -20,7 +20,7 @@ from bampipe.results.setup import SetupResult
 
 NAMED = [
     ("joint", "degrees for radians"),
-    ("joint", "motor constant left at 1"),
+    pytest.param("joint", "motor constant left at 1", marks=pytest.mark.long),
     ("axis", "clock and rate in milliseconds"),
     ("damper", "force and current exchanged"),
     ("bam", "encoder of the pitch reversed"),
@@ -48,7 +48,7 @@ def test_what_ingest_sees_is_said_by_ingest(mistake: str) -> None:
     ("machine", "effect"),
     [
         ("joint", "load_dependent_friction:joint"),
-        ("axis", "flexible_load:carriage"),
+        pytest.param("axis", "flexible_load:carriage", marks=pytest.mark.long),
         # A third of the torque about the pitch is left: other set-ups are tried, and none is right.
         ("bam", "gravity_compensator_lag"),
     ],
@@ -156,7 +156,7 @@ def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
 @pytest.mark.parametrize(
     ("machine", "column", "factors", "named"),
     [
-        ("joint", "q", (1, -1, 1, 1), "t02: joint"),
+        pytest.param("joint", "q", (1, -1, 1, 1), "t02: joint", marks=pytest.mark.long),
         pytest.param(
             "axis", "u", (1, -1, -1, 1), "t02 and t03: carriage or force_motor",
             marks=pytest.mark.long,
