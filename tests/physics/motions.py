@@ -108,6 +108,34 @@ def declaration(name="bam"):
     return copy.deepcopy(dict(registry.device(name).declaration))
 
 
+def made_up_device(kinetic, applied, parameters, **tables):
+    """A device of axes that slide unless ``tables`` say otherwise.
+
+    Args:
+        kinetic: energy; applied: by axis, expressions in ``force_x`` unless ``inputs`` says others;
+        parameters: unit, prior and sd by name.
+    """
+    keys = ("unit", "prior", "sd")
+    content = {
+        "name": "made_up",
+        "coordinates": {axis: {"kind": "linear"} for axis in applied},
+        "energy": {"kinetic": kinetic},
+        "inputs": {"force": ["force_x"]},
+        "applied": applied,
+        "parameters": {n: dict(zip(keys, row, strict=True)) for n, row in parameters.items()},
+    }
+    return registry.device_from(content | tables)
+
+
+def made_up_effect(scope, kind, parameters, **content):
+    """An effect with ``parameters``, unit, prior and sd by name."""
+    keys = ("unit", "prior", "sd")
+    about = {"name": "made_up", "summary": "a test's", "looks_like": "itself", "source": "a test"}
+    own = {n: dict(zip(keys, row, strict=True)) for n, row in parameters.items()}
+    own = {"scope": scope, "kind": kind, "parameters": own}
+    return registry.effect_from(about | own | content)
+
+
 def conservative_bam():
     """The BAM without compensator, friction and brakes: energies and the hand only."""
     bare = declaration()

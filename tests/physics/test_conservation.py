@@ -2,24 +2,17 @@
 
 import numpy as np
 import pytest
-from motions import conservative_bam, energies, typical_parameters
+from motions import conservative_bam, energies, made_up_effect, typical_parameters
 from scipy.integrate import solve_ivp
 
 from bampipe.physics import Model, compile_model, registry
 
 BAM = registry.device("bam")
-RUBBER = registry.effect_from(
-    {
-        "name": "rubber_band",
-        "summary": "Keeps the rod within reach",
-        "scope": "device",
-        "kind": "energy",
-        "looks_like": "a spring on extension",
-        "source": "this test",
-        "potential": "stiffness*(extension - 1)**2/2",
-        "parameters": {"stiffness": {"unit": "N/m", "prior": 400.0, "sd": 0.0}},
-    }
-)
+# A rubber band keeps the rod within reach.
+RUBBER = made_up_effect(
+    "device", "energy", {"stiffness": ("N/m", 400.0, 0.0)},
+    potential="stiffness*(extension - 1)**2/2",
+)  # fmt: skip
 
 
 def fly(system, x0, p, u=None, seconds=10.0):
@@ -46,7 +39,7 @@ def fly(system, x0, p, u=None, seconds=10.0):
 )
 def test_energy_is_conserved_without_friction(effects):
     device = conservative_bam()
-    system = compile_model(Model(device, ("rubber_band", *effects), (RUBBER,)))
+    system = compile_model(Model(device, ("made_up", *effects), (RUBBER,)))
     p = typical_parameters(system)
     _, x = fly(system, np.array([0.2, 0.4, 1.0, 1.5, -0.8, 0.3]), p)
     kinetic, potential = energies(system, x[:, :3], x[:, 3:], p)

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from motions import declaration
+from motions import declaration, made_up_device
 
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
@@ -143,24 +143,15 @@ def test_wrong_names_suggest_the_right_ones():
 
 
 def test_an_effect_says_when_a_device_lacks_what_it_needs():
-    rail = registry.device_from(
-        {
-            "name": "rail",
-            "coordinates": {"position": {"kind": "linear"}},
-            "energy": {"kinetic": "mass*ddt(position)**2/2"},
-            "inputs": {"force": ["force_motor"]},
-            "applied": {"position": "force_motor"},
-            "parameters": {"mass": {"unit": "kg", "prior": 2.0, "sd": 1.0}},
-        }
-    )
+    mass = {"mass": ("kg", 2.0, 1.0)}
+    rail = made_up_device("mass*ddt(position)**2/2", {"position": "force_x"}, mass, name="rail")
     for name in ("gravity_compensator_lag", "handle_payload", "base_tilt"):
         assert registry.effect(name).targets(rail) == ()
         with pytest.raises(InputError, match="device 'rail' does not have"):
             Model(rail, (name,))
     assert registry.effect("brake_residual_torque").targets(rail) == ()
-    assert registry.effect("force_gain").targets(rail) == ("motor",)
-    system = compile_model(Model(rail, ("force_gain:motor",)))
-    assert system.inputs == ("force_motor",)
+    assert registry.effect("force_gain").targets(rail) == ("x",)
+    assert compile_model(Model(rail, ("force_gain:x",))).inputs == ("force_x",)
 
 
 def test_force_pairs_of_long_names_leak_the_right_way():
