@@ -37,6 +37,12 @@ ELSEWHERE = [
         for name in ("channel_lag:current", "channel_saturation:current", "hysteresis:piston")
     ),
 ]  # fmt: skip
+# Through the poses, play is code of its own on every axis, and takes long to compile.
+SECOND_PLAY = ("backlash:pitch", "backlash:extension")
+TRIED = [
+    *(pytest.param(c, marks=[pytest.mark.long] * (c in SECOND_PLAY)) for c in CASES),
+    *ELSEWHERE,
+]
 CANONICAL = """
 stribeck presliding asymmetric_coulomb quadratic_drag position_dependent_friction
 load_dependent_friction thermal_damping return_spring inertia_mismatch handle_payload base_tilt
@@ -92,7 +98,7 @@ def test_says_what_a_user_needs(name):
 # Values -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("case", CASES + ELSEWHERE)
+@pytest.mark.parametrize("case", TRIED)
 def test_finite_everywhere(case):
     system = system_of(case)
     n, rng = 400, np.random.default_rng(7)
@@ -144,7 +150,7 @@ def test_an_active_effect_would_be_caught():
     assert (added * motion[1]).max() > 0.1
 
 
-@pytest.mark.parametrize("case", CASES + ELSEWHERE)
+@pytest.mark.parametrize("case", TRIED)
 def test_absent_at_zero_strength_and_there_at_typical(case):
     there = np.abs(contribution(case, typical)).max()
     left = np.abs(contribution(case, lambda system: typical(system, 0.0))).max()
