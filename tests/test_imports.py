@@ -240,6 +240,12 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.stderr.strip() == "[]"
 
 
+def test_the_report_draws_nothing_before_it_is_written() -> None:
+    code = "import bampipe.stages.report, sys; print('matplotlib' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
 def test_what_only_posix_has_is_not_needed_to_import(tmp_path: Path) -> None:
     """As on Windows: modules that are not there, functions and flags that `os` lacks."""
     code = (

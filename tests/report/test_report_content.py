@@ -217,6 +217,13 @@ def test_provenance_lists_inputs_versions_and_keys_in_order(full: Report) -> Non
     assert places == sorted(places)
 
 
+def test_a_device_of_no_paper_mentions_none(own_run: Path, full: Report) -> None:
+    assert "the paper's" in text_of(full.html)
+    path = own_run / "ingest/session.json"
+    path.write_text(path.read_text().replace('"bam"', '"slider"'))
+    assert "the paper's" not in text_of(page_of(own_run))
+
+
 def test_settings_that_all_models_share_stand_once(own_run: Path) -> None:
     record = json.loads((own_run / "run.json").read_text())
     stages = record["stages"]
