@@ -216,6 +216,7 @@ def test_a_form_that_cancels_the_drive_gains_nothing(clean):
     assert volume(own, at, np.ones(own.atoms[at].width)) == pytest.approx(0.0)
 
 
+@pytest.mark.long
 def test_hysteresis_of_a_force_sensor_is_found(tmp_path):
     session, _, fit = fit_bare(tmp_path, "bam", 7, "sensor_hysteresis:x")
     search = open_forms(session, fit, 0)

@@ -168,9 +168,10 @@ def test_a_model_with_a_delay_gets_no_timing_of_its_own(simulated: RunFolder) ->
 def test_the_force_noise_moves_the_encoder_of_an_axis_that_winds_up(tmp_path: Path) -> None:
     """Without that in the noise of the readings, the filter gave the friction as 14 for 4.2."""
     name = "transmission_compliance.yaw.compliance"
-    run = simulated_run(tmp_path, effect="transmission_compliance:yaw", hidden={name: 2e-3})
-    wound = MODEL.replace("[]", '["transmission_compliance:yaw"]')
-    write_text(run.path("models/base/model.toml"), wound)
+    wound = {"effect": "transmission_compliance:yaw", "hidden": {name: 2e-3}}
+    run = simulated_run(tmp_path, seconds=6.0, **wound)
+    text = MODEL.replace("[]", '["transmission_compliance:yaw"]')
+    write_text(run.path("models/base/model.toml"), text)
     content = identified(run, replace(FAST, method="ukf"))
     assert_recovered(content, TRUTH)
     assert content["parameters"][name]["estimate"] == pytest.approx(2e-3, rel=5e-3)

@@ -96,8 +96,8 @@ def test_truth_is_beside_and_never_inside(tmp_path):
 
 
 def test_human_like_motion(tmp_path):
-    out, _, _ = make(tmp_path, seed=3, trials=2)
-    for number in range(2):
+    out, _, _ = make(tmp_path, seed=3)
+    for number in range(5):
         _, t, q, force, brake = read(out, number)
         assert len(t) == 8000 and t[1] == pytest.approx(0.002)
         assert (np.ptp(q, axis=0) > [0.6, 0.4, 0.2]).all()
@@ -259,7 +259,7 @@ def test_mistakes_are_one_clear_line(tmp_path, options, message):
     assert not (tmp_path / "made").exists()
 
 
-@pytest.mark.parametrize("name", ["demo", pytest.param("first", marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", ["demo", "first"])
 def test_sample_sessions_are_what_their_truth_says(tmp_path, name):
     truth = json.loads((SAMPLES / f"{name}.truth.json").read_text())
     lists = {key: tuple(truth["configuration"][key]) for key in ("effects", "effect_files")}
