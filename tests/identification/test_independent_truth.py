@@ -11,7 +11,7 @@ DAYS = {
     "noise five times what is stated": {"noise_factor": 5.0},
     "mains hum and coarse encoders": {"hum": 10.0, "coarse": 8.0},
     "dropped samples and jitter": {"dropped": 0.02, "jitter": 0.1},
-    "true standstill": {"creep": False},
+    "true standstill": {"creep": False, "trials": 2},
 }
 
 
