@@ -171,12 +171,6 @@ def link_folder_out(root: Path) -> None:
     (root / "trials").symlink_to(root.parent / "elsewhere")
 
 
-def wrap(t):
-    # Put the zero of the counter in the middle of the motion, so that it wraps there.
-    moved = t["enc_yaw"] - np.rint(t["enc_yaw"].mean()) + 2.0**15
-    t["enc_yaw"][:] = np.mod(moved + 2.0**15, 2.0**16) - 2.0**15
-
-
 # name: (damage, what the one line must say)
 REFUSED: dict[str, tuple[Damage, str]] = {
     "no session file": (
@@ -396,7 +390,6 @@ REPAIRED: dict[str, tuple[Damage, str]] = {
         table(lambda t: t["time_us"].__setitem__(slice(800, None), t["time_us"][800:] + 1e6)),
         "1 gap of up to 1 s in the time stamps: rows 2 to 801 kept, 200 rows dropped",
     ),
-    "counter of 16 bits": (table(wrap), "column 'enc_yaw' wraps at 16 bits .*unwrapped"),
     "a wild encoder reading": (
         table(lambda t: np.add.at(t["enc_yaw"], 400, 40_000)),
         "column 'enc_yaw': 1 wild reading taken out.*1 missing sample interpolated",
@@ -413,7 +406,6 @@ SOUND: dict[str, tuple[Damage, str]] = {
     "nothing": (lambda made: None, ""),
     "blanks after commas": (text(lambda s: s.replace(",", ", ")), ""),
     "quoted names": (renamed(",".join(f'"{name}"' for name in COLUMNS)), ""),
-    "time since 1970": (table(lambda t: t["time_us"].__iadd__(1.79e15)), ""),
     "samples lost here and there": (
         rows(lambda n: np.delete(np.arange(n), [100, 300, 301])),
         "2 small gaps in the time stamps, about 3 samples missing",

@@ -41,7 +41,6 @@ schema = "bampipe.session/1"
 session_id = "arm"
 device = "joint.toml"
 sample_rate_hz = {rate}
-{more}
 [time]
 {time}
 [encoders]
@@ -61,13 +60,13 @@ I = 1.2 * np.sin(3 * T)  # noqa: E741
 
 
 def ingested(
-    folder: Path, text: str, *, time: str, encoder: str, current: str, more: str = "", rate=RATE
+    folder: Path, text: str, *, time: str, encoder: str, current: str
 ) -> tuple[pd.DataFrame, pd.Series, dict]:
     """Samples, the trial's row and session.json of a session over one log."""
     folder.mkdir(exist_ok=True)
     (folder / "joint.toml").write_text(DEVICE)
     (folder / "log.csv").write_text(text)
-    session = HEAD.format(rate=rate, time=time, encoder=encoder, current=current, more=more)
+    session = HEAD.format(rate=RATE, time=time, encoder=encoder, current=current)
     (folder / "session.toml").write_text(session)
     out = folder / "out"
     ingest.execute(RunFolder(out), out, ingest.Config(session=str(folder)), silent)
@@ -216,12 +215,6 @@ def test_units_that_contradict_the_file_are_refused(tmp_path, change, said):
     with pytest.raises(InputError) as caught:
         ingested(tmp_path / "wrong", text, **{**right, **change})
     assert said in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_the_layout_that_a_session_declares(tmp_path):
-    text = "".join(f"{t:.6f} {q:.6f} {i:.6f}\n" for t, q, i in zip(T, Q, I, strict=True))
-    more = '[csv]\nnames = ["t", "q", "i"]'
-    check(ingested(tmp_path, text, time='column = "t"\nunit = "s"', more=more, **PLAIN)[0])
 
 
 @pytest.mark.parametrize(
