@@ -12,12 +12,6 @@ from bampipe.physics.readable import describe_equations, model_equations
 BAM = registry.device("bam")
 
 
-@pytest.fixture(scope="module")
-def lines():
-    text = describe_equations(BAM)
-    return dict(line.strip().split(" = ", 1) for line in text.splitlines() if " = " in line)
-
-
 def value(text, q, qd, qdd=None):
     """Number that a printed expression stands for."""
     numbers = {c: v.value for c, v in BAM.constants.items()} | {"mass": 3.56}
@@ -29,7 +23,9 @@ def value(text, q, qd, qdd=None):
     return float(sp.sympify(python, locals=names).subs({names[n]: v for n, v in numbers.items()}))
 
 
-def test_what_is_printed_is_what_is_computed(lines):
+def test_what_is_printed_is_what_is_computed():
+    text = describe_equations(BAM).splitlines()
+    lines = dict(line.strip().split(" = ", 1) for line in text if " = " in line)
     system = compile_model(Model(BAM))
     q, qd = np.array([0.2, 0.4, 1.1]), np.array([0.5, -0.3, 0.2])
     matrix = system.mass_matrix(q[None], system.prior)[0]

@@ -124,19 +124,14 @@ def test_a_device_without_a_scale_is_refused(tmp_path: Path) -> None:
         inspected(tmp_path, free, used)
 
 
-@pytest.fixture(scope="module")
-def reversed_joint(tmp_path_factory: pytest.TempPathFactory) -> bampipe.Run:
-    root = tmp_path_factory.mktemp("reversed")
-    independent.record("joint", root / "session", 31, {}, mistakes.SHORT["joint"])
-    MISTAKES["joint"]["encoder reversed"].spoil(root / "session")
+def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
+    tmp_path: Path,
+) -> None:
+    independent.record("joint", tmp_path / "session", 31, {}, mistakes.SHORT["joint"])
+    MISTAKES["joint"]["encoder reversed"].spoil(tmp_path / "session")
     stages = '["ingest", "filter", "identify", "validate", "report"]'
     pipeline = mistakes.PIPELINE.replace('["ingest", "filter"]', stages)
-    return run_short(root / "session", root, pipeline)
-
-
-def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
-    reversed_joint: bampipe.Run,
-) -> None:
+    reversed_joint = run_short(tmp_path / "session", tmp_path, pipeline)
     (mistake,) = SetupResult.read(reversed_joint.root / "filter/setup.json").mistakes
     assert mistake.axes == ("joint",)
     assert mistake.error_before["joint"] > 50.0

@@ -196,18 +196,6 @@ def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:
 SPOILT, KEPT = "t02", ("t00", "t01")
 
 
-@pytest.fixture(scope="module")
-def spoilt(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """A run whose last trial has three times the force that moved it."""
-    run = simulated_run(tmp_path_factory.mktemp("spoilt"), trials=3, seconds=8.0)
-    path = run.path("filter/kinematics.parquet")
-    frame = read_parquet(path)
-    forces = [name for name in frame if name.startswith("force_")]
-    frame.loc[frame["trial_id"] == SPOILT, forces] *= 3.0
-    write_parquet(path, frame)
-    return run
-
-
 def judged(run: RunFolder, hold_out: bool) -> tuple[dict, dict]:
     """Identify and validate with the spoilt trial held out or not."""
     path: Path = run.path("ingest/trials.parquet")
@@ -220,7 +208,14 @@ def judged(run: RunFolder, hold_out: bool) -> tuple[dict, dict]:
     return tuple(read_json(run.path(name)) for name in names)
 
 
-def test_a_trial_held_out_moves_no_parameter_and_is_what_counts(spoilt: RunFolder) -> None:
+def test_a_trial_held_out_moves_no_parameter_and_is_what_counts(tmp_path: Path) -> None:
+    """The last of three trials has three times the force that moved it."""
+    spoilt = simulated_run(tmp_path, trials=3, seconds=8.0)
+    path = spoilt.path("filter/kinematics.parquet")
+    frame = read_parquet(path)
+    forces = [name for name in frame if name.startswith("force_")]
+    frame.loc[frame["trial_id"] == SPOILT, forces] *= 3.0
+    write_parquet(path, frame)
     seen, _ = judged(spoilt, False)
     assert seen["parameters"]["mass"]["estimate"] > 3.9
     unseen, verdict = judged(spoilt, True)
