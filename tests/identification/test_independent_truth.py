@@ -41,7 +41,11 @@ SHAKEN = {"trials": 3, "seconds": 4.0, "rate_hz": 100.0}
 
 @pytest.mark.parametrize(
     ("machine", "seed", "conditions"),
-    [("joint", 18, {}), ("axis", 19, {}), ("damper", 9401, SHAKEN)],
+    [
+        ("joint", 18, {}),
+        pytest.param("axis", 19, {}, marks=pytest.mark.long),
+        ("damper", 9401, SHAKEN),
+    ],
 )
 def test_machines_that_lack_nothing_are_identified(tmp_path, machine, seed, conditions):
     run, truth = record_run(tmp_path, machine, seed, **conditions)
