@@ -178,17 +178,6 @@ def test_a_typo_in_a_setting_changes_nothing(
     assert command("status", toy.root)[1].count("current") == 4
 
 
-def test_all_faults_of_a_file_are_said(toy: Toy, command: Command) -> None:
-    path = toy.folder / "own.toml"
-    path.write_text('schema = "bampipe.pipeline/1"\nname = 3\nstage = ["toy_read"]\nsummary = 1\n')
-    code, out, err = command("run", toy.session, "--pipeline", path, "--runs", toy.runs)
-    assert code == 2 and out == ""
-    lines = err.splitlines()
-    assert len(lines) == 4 and all(line.startswith("bampipe: error: ") for line in lines)
-    for words in ('key "stage"', "'stages' is missing", "name: found 3", "summary: found 1"):
-        assert words in err
-
-
 def test_a_session_may_be_named_by_its_file(toy: Toy, command: Command) -> None:
     file = toy.session / "session.toml"
     assert command("run", file, *toy.options)[0] == 0

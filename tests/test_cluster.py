@@ -155,7 +155,7 @@ def test_what_is_no_scheduler_is_one_line(
 def test_an_address_that_nobody_answers_at_is_one_line(
     toy: Toy, address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine, "PATIENCE_S", 3.0)
+    monkeypatch.setattr(engine, "PATIENCE_S", 0.5)
     with pytest.raises(InputError, match="no Dask scheduler answers"):
         run_on_cluster([toy.request()], address, ignore_event)
 

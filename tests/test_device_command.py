@@ -2,7 +2,6 @@
 
 import json
 import re
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
@@ -10,12 +9,8 @@ from xml.etree import ElementTree
 import pytest
 from conftest import Command
 from independent import arm
-from jsonschema import Draft202012Validator
 
 from bampipe.physics import registry
-from bampipe.physics.device import Device
-from bampipe.physics.effect import Effect
-from bampipe.schema import json_schema
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "devices.md"
 RAIL = re.findall(r"```toml\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.S)[0]
@@ -137,18 +132,6 @@ def test_effect_files_are_checked_on_every_target(tmp_path, rail, command: Comma
     file.write_text(SNAG.replace('unit = "N.m", prior = 0.0', 'unit = "N", prior = 0.0'))
     (line,) = faults(command("effects", "check", f"{file}:yaw"))
     assert "torque: is N where N.m is needed" in line
-
-
-def test_the_schema_knows_what_the_program_knows() -> None:
-    check = Draft202012Validator(json_schema(Device)).validate
-    for name in registry.device_names():
-        check(registry.device(name).declaration)
-    check(tomllib.loads(RAIL))
-
-
-@pytest.mark.parametrize("name", registry.effect_names())
-def test_the_schema_of_effects_takes_the_built_in_ones(name: str) -> None:
-    Draft202012Validator(json_schema(Effect)).validate(registry.effect(name).declaration)
 
 
 def test_a_robot_is_drawn_where_its_joints_are(tmp_path: Path, command: Command) -> None:

@@ -1,6 +1,6 @@
 """The independent simulators record what they promise, under names that bampipe knows."""
 
-import tomllib
+from dataclasses import replace
 
 import independent
 import numpy as np
@@ -8,19 +8,12 @@ import pandas as pd
 import pytest
 from independent import arm
 from independent.sensors import HARD, Conditions
+from independent_runs import device_of
 from scipy.interpolate import CubicSpline
 
-from bampipe.physics import Model, registry
+from bampipe.physics import Model
 
-DEVICES = {"bam": "bam", "axis": "slider", "damper": "magnetic_damper"}
 BRIEF = Conditions(trials=1, seconds=0.8)
-
-
-def device_of(machine):
-    known = independent.MACHINES[machine]
-    if machine not in DEVICES:
-        return registry.device_from(tomllib.loads(known.DEVICE), f"{machine}.toml")
-    return registry.device(DEVICES[machine])
 
 
 def content(folder):
@@ -36,7 +29,7 @@ def content(folder):
 )
 def test_every_effect_changes_what_is_recorded(tmp_path, machine):
     known = independent.MACHINES[machine]
-    free = Conditions(trials=1, seconds=6.0)
+    free = Conditions(trials=1, seconds=3.0)
     braked = Conditions(trials=1, seconds=1.5, viscous_trials=1)
     bare = {}
     for name, day in (("free", free), ("braked", braked)):
@@ -76,8 +69,10 @@ def test_a_seed_gives_the_same_bytes_and_another_seed_others(tmp_path, machine):
 
 @pytest.mark.parametrize("day", HARD)
 def test_conditions_change_the_recording_and_not_the_machine(tmp_path, day):
-    truth = independent.record("joint", tmp_path / "bare", 7)
-    hard = independent.record("joint", tmp_path / "hard", 7, conditions=HARD[day])
+    brief = {"trials": 1, "seconds": 4.0}
+    truth = independent.record("joint", tmp_path / "bare", 7, {}, Conditions(**brief))
+    short = {"trials": 2} if day == "three short trials" else brief
+    hard = independent.record("joint", tmp_path / "hard", 7, {}, replace(HARD[day], **short))
     assert content(tmp_path / "bare") != content(tmp_path / "hard")
     assert truth["parameters"] == hard["parameters"]
 

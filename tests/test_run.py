@@ -157,13 +157,6 @@ def test_until_and_force_choose_the_steps(toy: Toy) -> None:
 # Faults
 
 
-def test_bad_input_leaves_no_run_folder(toy: Toy) -> None:
-    (toy.session / "numbers.txt").write_text("1 two")
-    with pytest.raises(InputError, match=r"numbers\.txt.*write whole numbers"):
-        toy.run()
-    assert not toy.root.exists()
-
-
 def test_a_session_that_is_refused_changes_nothing(toy: Toy) -> None:
     toy.run()
     good, written = toy.files(), (toy.root / record.FILE).read_bytes()

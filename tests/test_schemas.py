@@ -26,6 +26,7 @@ from bampipe.schema import (
 
 ROOT = Path(__file__).parent.parent
 SHIPPED = [*ROOT.glob("pipelines/*.toml"), *ROOT.glob("sample_runs/*/*.toml")]
+SHIPPED += ROOT.glob("bampipe/physics/*/*.toml")
 SCRIPT = runpy.run_path(str(ROOT / ".ci" / "write_schemas.py"))
 
 

@@ -13,7 +13,6 @@ from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.recording import describe_spans, read_recording
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.survey import survey, words
-from bampipe.data.units import unit
 from bampipe.errors import InputError
 from bampipe.setup.proposal import propose
 
@@ -281,15 +280,6 @@ def test_a_log_out_of_order_is_refused(tmp_path: Path, order: np.ndarray):
     write(tmp_path / "a.csv", "time_s,q,torque", t, np.sin(3 * t), np.cos(3 * t))
     with pytest.raises(InputError, match=r"time_s falls from row to row.*sort its rows"):
         propose(tmp_path)
-
-
-def test_units_that_labs_write():
-    for text, scale in (
-        ("U/min", 0.10472), ("gon", 0.0157080), ("grados", 0.0174533), ("daN", 10.0),
-        ("10^-3 s", 1e-3), ("NM", 1.0), ("N・m", 1.0),
-    ):  # fmt: skip
-        found = unit(text)
-        assert found is not None and found.scale == pytest.approx(scale, rel=1e-4)
 
 
 def test_data_of_other_kinds_are_named_with_what_to_do(tmp_path: Path):

@@ -13,7 +13,7 @@ from bampipe.results.identify import IdentifyResult
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed: pip install mujoco")
 
-RATE, SECONDS = 1000, 3.0
+RATE, SECONDS = 1000, 2.0
 URDF = """<robot name="two"><link name="base"/>
 <link name="upper"><inertial><origin xyz="0.2 0 0"/><mass value="2"/>
 <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.05" iyz="0" izz="0.05"/></inertial></link>

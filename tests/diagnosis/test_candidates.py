@@ -96,8 +96,11 @@ NAMED = [
     ("wrist", 56, "unbalance:a", ("force_bias:a", "torque_ripple:a", "return_spring:a")),
     ("damper", 57, "upper_stop:piston", ("return_spring:piston", "quadratic_drag:piston")),
     ("bam", 59, "backlash:yaw", ("presliding:yaw", "maxwell_slip:yaw")),
-    ("axis", 58, "maxwell_slip:carriage", ("presliding:carriage", "stribeck:carriage")),
-]
+    pytest.param(
+        "axis", 58, "maxwell_slip:carriage", ("presliding:carriage", "stribeck:carriage"),
+        marks=pytest.mark.long,
+    ),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("machine", "seed", "effect", "rivals"), NAMED)

@@ -73,12 +73,6 @@ def clean(tmp_path_factory):
     return fit_bare(tmp_path_factory.mktemp("clean"), "bam", 6)
 
 
-@pytest.fixture(scope="module")
-def damper(tmp_path_factory):
-    """Trials in which a coil is commanded."""
-    return fit_bare(tmp_path_factory.mktemp("damper"), "damper", 6)
-
-
 def test_the_draft_is_the_curve_that_was_hidden(detent):
     _, found = detent
     axis = found.axes["joint"]
@@ -151,10 +145,10 @@ def test_a_formula_in_what_is_measured_is_told_from_chance(clean):
 
 
 @pytest.mark.long
-def test_columns_of_forms_are_those_of_the_compiled_effects(clean, damper):
+def test_columns_of_forms_are_those_of_the_compiled_effects(clean, tmp_path):
     """Every shape and factor once: the grammar's text and its columns must say the same."""
     seen = set()
-    for _, recipe, fit in (clean, damper):
+    for _, recipe, fit in (clean, fit_bare(tmp_path, "damper", 6)):  # of which a coil is commanded
         evidence = fit.evidence
         samples = lay_out_samples(evidence, Criteria().block_s)
         forms = FormDictionary(evidence, samples, 0)
@@ -216,6 +210,7 @@ def test_a_form_that_cancels_the_drive_gains_nothing(clean):
     assert volume(own, at, np.ones(own.atoms[at].width)) == pytest.approx(0.0)
 
 
+@pytest.mark.long
 def test_hysteresis_of_a_force_sensor_is_found(tmp_path):
     session, _, fit = fit_bare(tmp_path, "bam", 7, "sensor_hysteresis:x")
     search = open_forms(session, fit, 0)

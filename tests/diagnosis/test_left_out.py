@@ -13,7 +13,9 @@ from bampipe.trials.residuals import rms
 STRIBECK = {"stribeck.yaw.force": 1.1, "stribeck.yaw.speed": 0.05}
 
 
-@pytest.mark.parametrize(("values", "count"), [({}, 4), (STRIBECK, 3), (STRIBECK, 1)])
+@pytest.mark.parametrize(
+    ("values", "count"), [pytest.param({}, 4, marks=pytest.mark.long), (STRIBECK, 3), (STRIBECK, 1)]
+)
 def test_an_estimate_moves_and_errs_as_a_fit_to_the_rest(
     values: dict[str, float], count: int
 ) -> None:

@@ -38,7 +38,7 @@ def moved(trials, change):
         pytest.param("bam", 6, {}, marks=pytest.mark.long),
         pytest.param("bam", 6, {"coarse": 8.0}, marks=pytest.mark.long),
         ("axis", 58, {"creep": False}),  # it truly stops: no Stribeck friction, no compliance
-        ("joint", 5, {}),
+        pytest.param("joint", 5, {}, marks=pytest.mark.long),
         ("joint", 70008, {"noise_factor": 5.0}),  # two shifts would make a low-pass of it
     ],
 )
@@ -66,7 +66,7 @@ def test_one_event_decides_nothing(record, seconds):
     assert verdicts(found) != ["missing"]
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.long), False])
 @pytest.mark.parametrize("seed", [8, *(pytest.param(k, marks=pytest.mark.long) for k in (9, 10))])
 def test_a_lag_gains_nothing_by_averaging_noise(record, seed, known):
     trials, recipe = record("joint", 4)

@@ -121,7 +121,7 @@ def test_the_jumps_of_a_drive_that_acts_or_is_read_late_are_seen(late: float) ->
     assert not jumps(np.convolve(given, np.ones(10) / 10.0, mode="same"))
 
 
-@pytest.mark.parametrize("machine", ["axis", "joint"])
+@pytest.mark.parametrize("machine", [pytest.param("axis", marks=pytest.mark.long), "joint"])
 def test_a_replicate_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tmp_path) -> None:
     """By another simulator; moved by time derivatives within the band, it was up to 27 % off."""
     trials, recipe, _ = record_trials(

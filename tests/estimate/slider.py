@@ -2,10 +2,12 @@
 
 import math
 import sys
+from functools import partial
 
 import numpy as np
 from numba import njit
 
+from bampipe import compiled
 from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial
 from bampipe.model_functions import DERIVATIVE, DERIVATIVE_ROWS, MEASURE, MEASURE_ROWS, ROWS
 
@@ -14,21 +16,23 @@ TRUTH = np.array([4.0, 1.1, 2.0])
 RESOLUTION = 2e-5
 FORCE_SD = 0.05
 RATE = 500.0
+# Of processes that collect tests at once, one compiles what functions take as arguments.
+argument = partial(compiled.njit, cache=True, no_cfunc_wrapper=False)
 
 
-@njit(DERIVATIVE.signature, cache=True)
+@argument(DERIVATIVE.signature)
 def derivative(x, u, p, w, dx):
     dx[0] = x[1]
     dx[1] = (u[0] + w[0] - p[0] * x[1] - p[1] * math.tanh(x[1] / 1e-3)) / p[2]
 
 
-@njit(MEASURE.signature, cache=True)
+@argument(MEASURE.signature)
 def measure(x, u, p, y):
     y[0] = x[0]
     y[1] = x[1]
 
 
-@njit(DERIVATIVE_ROWS.signature, cache=True)
+@argument(DERIVATIVE_ROWS.signature)
 def derivative_rows(count, x, u, p, w, dx):
     for r in range(count):
         friction = p[r] * x[ROWS + r] + p[ROWS + r] * math.tanh(x[ROWS + r] / 1e-3)
@@ -36,7 +40,7 @@ def derivative_rows(count, x, u, p, w, dx):
         dx[ROWS + r] = (u[r] + w[r] - friction) / p[2 * ROWS + r]
 
 
-@njit(MEASURE_ROWS.signature, cache=True)
+@argument(MEASURE_ROWS.signature)
 def measure_rows(count, x, u, p, y):
     for r in range(count):
         y[r] = x[r]

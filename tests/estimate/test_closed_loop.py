@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from numba import njit
+from slider import argument
 
 from bampipe.errors import InputError
 from bampipe.estimate.closed_loop import simulate_controlled
@@ -13,19 +13,19 @@ MASS, STIFFNESS, DAMPING = 2.0, 800.0, 8.0
 DT, WIDTH = 0.002, np.array([1e-3])
 
 
-@njit(DERIVATIVE.signature, error_model="numpy")
+@argument(DERIVATIVE.signature, error_model="numpy")
 def derivative(x, u, p, w, dx):
     dx[0] = x[1]
     dx[1] = (u[0] + w[0]) / p[0]
 
 
-@njit(MEASURE.signature)
+@argument(MEASURE.signature)
 def measure(x, u, p, y):
     y[0] = x[0] + p[1] * u[0]
     y[1] = x[1]
 
 
-@njit(COMMAND.signature)
+@argument(COMMAND.signature)
 def command(y, r, none, out):
     out[0] = min(max(r[1] * (r[0] - y[0]) - 8.0 * y[1], -r[2]), r[2])
 
@@ -74,7 +74,7 @@ def test_a_controller_is_late_saturates_and_sees_its_encoders():
         )  # fmt: skip
 
 
-@njit(COMMAND.signature)
+@argument(COMMAND.signature)
 def with_integral(y, r, s, out):
     out[0] = r[1] * (r[0] - y[0]) - 80.0 * y[1] + 400.0 * s[0] - 6.0
     out[1] = r[0] - y[0]

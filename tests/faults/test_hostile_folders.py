@@ -12,11 +12,9 @@ from conftest import Command, Toy
 
 from bampipe.api import loop
 from bampipe.data.session import read_session
-from bampipe.declarations.model import ModelFile
 from bampipe.errors import InputError
 from bampipe.files import is_inside, is_normal, read_json, read_toml
 from bampipe.results.run import is_result
-from bampipe.run import models
 from bampipe.run.events import ignore_event
 
 
@@ -70,7 +68,7 @@ def plant(
     return folder
 
 
-@pytest.mark.parametrize("name", ["run.json", ".bampipe/staging", "toy"])
+@pytest.mark.parametrize("name", ["run.json", ".bampipe/lock", ".bampipe/staging", "toy"])
 def test_a_folder_for_a_file_or_a_file_for_a_folder_is_one_line_or_mended(
     toy: Toy, outside: Path, command: Command, name: str
 ) -> None:
@@ -267,11 +265,3 @@ def test_an_effect_whose_name_is_a_path_writes_nothing(toy: Toy, outside: Path) 
             loop.extend(options, "base", (name,))
     changed = {k for k, v in everything(toy.folder).items() if before.get(k, 0) != v}
     assert changed <= {str(toy.root / ".bampipe/lock")}
-
-
-def test_an_unfinished_model_is_not_the_one_to_extend(tmp_path: Path) -> None:
-    models.write(tmp_path, ModelFile(name="base", device="slider"))
-    effect = "stribeck:carriage"
-    child = models.child_name("base", (effect,))
-    models.write(tmp_path, ModelFile(name=child, parent="base", device="slider", effects=(effect,)))
-    assert models.default_model(tmp_path) == "base"

@@ -66,25 +66,6 @@ def test_progress_takes_a_trial_for_text(name: str, monkeypatch: pytest.MonkeyPa
     assert printable(name) in screen.getvalue()
 
 
-def test_a_column_of_a_log_cannot_move_the_cursor(tmp_path: Path, command: Command) -> None:
-    folder = tmp_path / "s"
-    folder.mkdir()
-    name = CLEAR_SCREEN.replace("\x1b", "\\u001b")
-    (folder / "session.toml").write_text(
-        f"""schema = "bampipe.session/1"
-session_id = "s"
-device = "slider{name}"
-sample_rate_hz = 100.0
-trials = [{{ file = "a{name}.csv", kind = "free" }}]
-[encoders]
-carriage = {{ column = "x", counts_per_unit = 1.0, unit = "m" }}
-"""
-    )
-    code, out, err = command("run", folder, "--runs", tmp_path / "runs")
-    assert code == 2 and "\\x1b[2J" in err, err
-    assert "\x1b" not in out + err
-
-
 @pytest.mark.parametrize("control", CONTROLS)
 def test_junit_is_xml_whatever_a_session_is_called(control: str) -> None:
     given = {"gate": f"gate{control}", "key": f"yaw{control}", "message": f"bad{control}{MARKUP}"}

@@ -117,10 +117,3 @@ def test_results_come_in_order_and_what_ends_a_worker_is_said() -> None:
     with pytest.raises(ValueError, match="unlucky") as caught, process_pool(2, os.getpid) as pool:
         list(pool.map(double, [1, 13]))
     assert "in double" in caught.value.__notes__[0]
-
-
-def test_a_folder_in_place_of_the_lock_is_said(toy: Toy) -> None:
-    path = toy.root / ".bampipe" / "lock"
-    path.mkdir(parents=True)
-    with pytest.raises(InputError, match="a folder is in the way of a file"):
-        toy.run()

@@ -26,8 +26,17 @@ def propose(run: bampipe.Run, **settings) -> tuple[NextResult, Path]:
     return NextResult.read(path), path
 
 
-def test_bad_requests_are_refused_in_one_line(tmp_path):
-    run, _ = record_run(tmp_path, "joint", 5)
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("now")
+
+
+@pytest.fixture(scope="module")
+def run(root) -> bampipe.Run:
+    return record_run(root, "joint", 922, **LONG)[0]
+
+
+def test_bad_requests_are_refused_in_one_line(run):
     with pytest.raises(InputError, match=r"coulomb\.join'.*coulomb\.joint"):
         bampipe.run_stage(run, "next", purpose="coulomb.join")
     with pytest.raises(InputError, match=r"no diagnosis yet.*bampipe diagnose"):
@@ -36,8 +45,7 @@ def test_bad_requests_are_refused_in_one_line(tmp_path):
     assert "next:base" not in content["stages"]
 
 
-def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(tmp_path):
-    run, _ = record_run(tmp_path / "now", "joint", 922, **LONG)
+def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(root, run):
     names = ("coulomb.joint", "viscous.joint", "inertia", "moment")
     found, path = propose(run, purpose="coulomb.joint", seconds=12.0, plan=True, sd=0.002)
     assert found.plan is not None
@@ -54,10 +62,10 @@ def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(tmp_path)
     assert read_forecasts(run.root, "base") == (other, easy)
     # The same run folder, the session with the proposed trial in it.
     independent.record(
-        "joint", tmp_path / "now" / "joint", 922, {},
+        "joint", root / "joint", 922, {},
         replace(SHORT["joint"], **LONG, tasks=Task.read(path)),
     )  # fmt: skip
-    again = run_short(tmp_path / "now" / "joint", tmp_path / "now")
+    again = run_short(root / "joint", root)
     identified = IdentifyResult.read(again.root / IdentifyResult.file("base"))
     (said,) = compare_forecast(easy, identified, None)
     came = identified.parameters["coulomb.joint"].sd

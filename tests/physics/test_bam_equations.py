@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import bam_oracle as oracle
 import numpy as np
 import pytest
-from motions import random_motion, with_values
+from motions import made_up_device, made_up_effect, random_motion, with_values
 from scipy.linalg import expm
 
 from bampipe.physics import Model, System, compile_model, registry
@@ -20,19 +20,9 @@ def system():
 
 def probe(expression):
     """What ``expression`` of the device file is worth along a motion: (q, qd) -> (T,)."""
-    effect = registry.effect_from(
-        {
-            "name": "probe",
-            "summary": "shows one quantity",
-            "scope": "device",
-            "kind": "torque",
-            "looks_like": "itself",
-            "source": "this test",
-            "torque": {"yaw": f"scale*({expression})"},
-            "parameters": {"scale": {"unit": "", "prior": 1.0, "sd": 0.0}},
-        }
-    )
-    shown = compile_model(Model(BAM, ("probe",), (effect,)))
+    torque = {"yaw": f"scale*({expression})"}
+    effect = made_up_effect("device", "torque", {"scale": ("", 1.0, 0.0)}, torque=torque)
+    shown = compile_model(Model(BAM, ("made_up",), (effect,)))
 
     def values(q, qd):
         u = np.zeros((len(q), len(shown.inputs)))
@@ -201,17 +191,13 @@ def test_a_brake_holds_an_axis_that_is_pushed_less_than_its_command(system):
 
 
 def test_singular_mass_matrix_gives_a_value_that_is_not_finite_instead_of_a_wrong_one():
-    pendulum = registry.device_from(
-        {
-            "name": "telescope",
-            "coordinates": {"angle": {"kind": "rotary"}, "length": {"kind": "linear"}},
-            "energy": {"kinetic": "mass*(length**2*ddt(angle)**2 + ddt(length)**2)/2"},
-            "inputs": {"force": ["force_x"]},
-            "applied": {"angle": "length*force_x"},
-            "parameters": {"mass": {"unit": "kg", "prior": 1.0, "sd": 0.1}},
-        }
+    telescope = made_up_device(
+        "mass*(length**2*ddt(angle)**2 + ddt(length)**2)/2",
+        {"angle": "length*force_x"},
+        {"mass": ("kg", 1.0, 0.1)},
+        coordinates={"angle": {"kind": "rotary"}, "length": {"kind": "linear"}},
     )
-    system = compile_model(Model(pendulum))
+    system = compile_model(Model(telescope))
     rate = np.empty(4)
     system.derivative(np.zeros(4), np.zeros(1), system.prior, np.zeros(1), rate)
     assert not np.isfinite(rate).all()

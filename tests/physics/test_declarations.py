@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from motions import declaration
+from motions import declaration, made_up_device
 
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
@@ -127,40 +127,23 @@ def test_sensor_offset_that_cannot_be_differentiated_is_refused(offset):
         compile_model(Model(BAM, ("encoder_scale:yaw",), (registry.effect_from(entries),)))
 
 
-def test_wrong_names_suggest_the_right_ones():
-    with pytest.raises(InputError, match="did you mean 'stribeck'"):
-        Model(BAM, ("stribek:yaw",))
-    with pytest.raises(InputError, match="did you mean 'pitch'"):
-        Model(BAM, ("stribeck:pich",))
+def test_an_effect_has_a_target_once():
     with pytest.raises(InputError, match="choose from stribeck:yaw, stribeck:pitch"):
         Model(BAM, ("stribeck",))
     with pytest.raises(InputError, match="already in the model"):
         Model(BAM, ("stribeck:yaw", "stribeck:yaw"))
-    with pytest.raises(InputError, match="did you mean 'bam'"):
-        registry.device("bum")
-    with pytest.raises(InputError, match="did you mean 'stribeck'"):
-        registry.effect("stribec")
 
 
 def test_an_effect_says_when_a_device_lacks_what_it_needs():
-    rail = registry.device_from(
-        {
-            "name": "rail",
-            "coordinates": {"position": {"kind": "linear"}},
-            "energy": {"kinetic": "mass*ddt(position)**2/2"},
-            "inputs": {"force": ["force_motor"]},
-            "applied": {"position": "force_motor"},
-            "parameters": {"mass": {"unit": "kg", "prior": 2.0, "sd": 1.0}},
-        }
-    )
+    mass = {"mass": ("kg", 2.0, 1.0)}
+    rail = made_up_device("mass*ddt(position)**2/2", {"position": "force_x"}, mass, name="rail")
     for name in ("gravity_compensator_lag", "handle_payload", "base_tilt"):
         assert registry.effect(name).targets(rail) == ()
         with pytest.raises(InputError, match="device 'rail' does not have"):
             Model(rail, (name,))
     assert registry.effect("brake_residual_torque").targets(rail) == ()
-    assert registry.effect("force_gain").targets(rail) == ("motor",)
-    system = compile_model(Model(rail, ("force_gain:motor",)))
-    assert system.inputs == ("force_motor",)
+    assert registry.effect("force_gain").targets(rail) == ("x",)
+    assert compile_model(Model(rail, ("force_gain:x",))).inputs == ("force_x",)
 
 
 def test_force_pairs_of_long_names_leak_the_right_way():

@@ -1,7 +1,6 @@
 """Expressions are data: a whitelist, bounded in size, and nothing but InputError for the rest."""
 
 import ast
-import contextlib
 import math
 import time
 
@@ -124,13 +123,6 @@ def test_definitions_that_multiply_each_other_are_refused_quickly():
     with pytest.raises(InputError, match="definitions and rates are expanded"):
         compile_model(Model(device))
     assert time.process_time() - start < 10.0
-
-
-@settings(max_examples=400, deadline=None)
-@given(st.text(max_size=80))
-def test_random_text_never_raises_anything_but_input_error(text):
-    with contextlib.suppress(InputError):
-        read(text)
 
 
 PARTS = [*"0123456789.+-*/()eE ,_", "**", "yaw", "pitch", "sin(", "max(", "ddt(", "log(", "exp("]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from motions import (
     declaration,
+    made_up_device,
     memory_within_reason,
     random_inputs,
     random_motion,
@@ -214,16 +215,9 @@ def test_generated_code_is_the_same_text_again(tmp_path, monkeypatch):
 def awkward(names):
     """A mass on a rail whose coordinate and channel carry the names of generated variables."""
     coordinate, component, parameter = names
-    return registry.device_from(
-        {
-            "name": "rail",
-            "coordinates": {coordinate: {"kind": "linear"}},
-            "energy": {"kinetic": f"{parameter}*ddt({coordinate})**2/2"},
-            "inputs": {"force": [f"force_{component}"]},
-            "applied": {coordinate: f"force_{component}"},
-            "parameters": {parameter: {"unit": "kg", "prior": 2.0, "sd": 1.0}},
-        }
-    )
+    force, mass = f"force_{component}", {parameter: ("kg", 2.0, 1.0)}
+    kinetic, inputs = f"{parameter}*ddt({coordinate})**2/2", {"force": [force]}
+    return made_up_device(kinetic, {coordinate: force}, mass, inputs=inputs)
 
 
 @pytest.mark.parametrize(

@@ -2,49 +2,13 @@
 
 import numpy as np
 import pytest
-from motions import of_mechanism, with_values
+from motions import RATE, of_mechanism, residual, smooth_motion, with_values
 from motions import typical_parameters as typical
-from scipy.optimize import least_squares
 from small_arm import ARM
 
 from bampipe.estimate.simulation import Arm, make_plant, simulate
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.effect import unit_of
-
-RATE = 250.0
-
-
-def smooth(system, seed=5):
-    """A made-up smooth motion with inputs, 4 s: q, qd, qdd, u, t."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(1000) / RATE
-
-    def waves(size):
-        w = 2 * np.pi * rng.uniform(0.3, 1.5, 6)
-        phase, scale = rng.uniform(0, 6.28, 6), size * rng.normal(size=6)
-        angle = w[:, None] * t + phase[:, None]
-        return [scale @ (w[:, None] ** k * np.sin(angle + k * np.pi / 2)) for k in range(7)]
-
-    rotary = system.model.device.coordinates[0].kind == "rotary"
-    q, qd, qdd, *_ = waves(0.3 if rotary else 0.02)
-    columns = {"t": t}
-    for force in system.model.device.forces:
-        for k, column in enumerate(waves(0.3 if rotary else 60.0)):
-            kind = ("", "rate", "curvature", "third", "fourth", "fifth", "sixth")[k]
-            stem = force.removeprefix("force_")
-            name = f"force_{kind}_{stem}" if force != stem else f"{force}_{kind}"
-            columns[name if kind else force] = column
-    for channel in system.model.device.channels:
-        columns[channel] = 1.0 + np.abs(waves(0.5)[0])
-    u = np.column_stack([columns[name] for name in system.inputs])
-    return q[:, None], qd[:, None], qdd[:, None], u, t
-
-
-def residual(system, p, motion):
-    *read, u, t = motion
-    at = of_mechanism(system, *read, u, p, t)
-    z = system.memory(*at, u, p, t)
-    return (system.applied(*at, z, u, p) - system.required(*at, z, u, p))[:, 0]
 
 
 @pytest.mark.parametrize(("word", "sign"), [("sum", 1.0), ("difference", -1.0)])
@@ -89,50 +53,6 @@ def test_friction_by_pose_takes_every_two_axes_from_the_middle_of_the_other():
     np.testing.assert_allclose(added, [[-(1.5 + 0.7 * 0.5) * 0.2, 0.0, 0.0]], rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("machine", "case"),
-    [
-        ("slider", "torque_ripple:carriage"),
-        ("slider", "actuator_lag:motor"),
-        ("slider", "actuator_delay"),
-        ("slider", "drive_sag:carriage"),
-        ("slider", "flexible_load:carriage"),
-        ("slider", "loose_load:carriage"),
-        ("slider", "loose_drive:carriage"),
-        ("slider", "force_delay"),
-        ("magnetic_damper", "channel_lag:current"),
-        ("magnetic_damper", "channel_saturation:current"),
-        ("magnetic_damper", "hysteresis:piston"),
-    ],
-)
-def test_is_absent_at_zero_and_recovered_from_a_wrong_guess(machine, case):
-    device = registry.device(machine)
-    bare, system = compile_model(Model(device)), compile_model(Model(device, [case]))
-    motion = smooth(system)
-    count = len(bare.parameters)
-    base = np.array([p.prior + 0.3 * p.sd for p in bare.parameters])
-    none, truth = typical(system, 0.0), typical(system)
-    none[:count] = truth[:count] = base
-    plain = residual(bare, base, smooth(bare))
-    # What keeps a lag's rate finite leaves its smallest time constant, 1 or 2 ms.
-    scale = np.abs(residual(system, truth, motion) - plain).max()
-    assert np.isfinite(scale) and scale > 0.0
-    np.testing.assert_allclose(residual(system, none, motion), plain, atol=0.05 * scale)
-    goal = residual(system, truth, motion)
-    free = [i for i in range(count, len(truth)) if not system.parameters[i].fixed]
-    sizes = np.abs(truth[free])
-
-    def error(x):
-        p = truth.copy()
-        p[free] = x * sizes
-        return (residual(system, p, motion) - goal) / scale
-
-    start = np.sign(truth[free]) * np.linspace(0.9, 1.1, len(free))
-    start[0] *= 0.7
-    found = least_squares(error, start, diff_step=1e-4)
-    np.testing.assert_allclose(found.x, np.sign(truth[free]), rtol=0.02)
-
-
 def test_motor_effects_are_offered_to_motors_only():
     motors = (
         "torque_ripple", "actuator_lag", "actuator_delay", "drive_sag", "flexible_load",
@@ -170,7 +90,7 @@ def test_a_gear_loses_of_the_load_behind_it_without_the_rotor(stiffness):
     """Closed form: the drive gives what the motion takes, and the loss by what crosses the gear."""
     names = ["gear_loss:joint", *(["return_spring:joint"] if stiffness else [])]
     system = compile_model(Model(_geared_joint("-9*cos(joint)"), names))
-    q, qd, qdd, _, t = smooth(system)
+    q, qd, qdd, _, t = smooth_motion(system)
     behind, share, pull = 0.45, 0.12, 9.0 * np.sin(q) + stiffness * q
     load = pull + behind * 2.0 * qdd
     torque = 2.0 * qdd + pull + qd + np.sign(qd) + share * np.abs(load) * np.sign(qd)
@@ -246,7 +166,7 @@ def test_wind_up_goes_with_a_force_that_is_late(late):
     """Its offset is differentiated, which neither a state nor a last derivative allows."""
     effects = (late, "transmission_compliance:joint")
     system = compile_model(Model(registry.device("servo_pendulum"), effects))
-    q, qd, qdd, u, t = smooth(system)
+    q, qd, qdd, u, t = smooth_motion(system)
     p = typical(system, 1.0)
     true = of_mechanism(system, q, qd, qdd, u, p, t)
     z = system.memory(*true, u, p, t)

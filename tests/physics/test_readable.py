@@ -3,18 +3,13 @@
 import numpy as np
 import pytest
 import sympy as sp
+from motions import made_up_device
 
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.readable import describe_equations, model_equations
 
 BAM = registry.device("bam")
-
-
-@pytest.fixture(scope="module")
-def lines():
-    text = describe_equations(BAM)
-    return dict(line.strip().split(" = ", 1) for line in text.splitlines() if " = " in line)
 
 
 def value(text, q, qd, qdd=None):
@@ -28,7 +23,9 @@ def value(text, q, qd, qdd=None):
     return float(sp.sympify(python, locals=names).subs({names[n]: v for n, v in numbers.items()}))
 
 
-def test_what_is_printed_is_what_is_computed(lines):
+def test_what_is_printed_is_what_is_computed():
+    text = describe_equations(BAM).splitlines()
+    lines = dict(line.strip().split(" = ", 1) for line in text if " = " in line)
     system = compile_model(Model(BAM))
     q, qd = np.array([0.2, 0.4, 1.1]), np.array([0.5, -0.3, 0.2])
     matrix = system.mass_matrix(q[None], system.prior)[0]
@@ -49,23 +46,14 @@ def test_what_is_printed_is_what_is_computed(lines):
     assert lines["mass"] == "3.56 ± 0.5 kg  (prior, to be estimated)"
 
 
-def make_rail(**entries):
-    return registry.device_from(
-        {
-            "name": "rail",
-            "coordinates": {"s": {"kind": "linear"}},
-            "inputs": {"force": ["force_x"]},
-            "applied": {"s": "force_x"},
-            "parameters": {"mass": {"unit": "kg", "prior": 2.0, "sd": 1.0}},
-            **entries,
-        }
-    )
-
-
 def test_names_of_constants_may_be_those_of_internal_symbols():
-    rail = make_rail(
-        constants={"p0": {"value": 2.0, "unit": "1"}, "q0": {"value": 3.0, "unit": "N"}},
-        energy={"kinetic": "p0*mass*ddt(s)**2/2", "potential": "q0*s"},
+    kinetic, constants = "p0*mass*ddt(s)**2/2", {"p0": ("1", 2.0), "q0": ("N", 3.0)}
+    rail = made_up_device(
+        kinetic,
+        {"s": "force_x"},
+        {"mass": ("kg", 2.0, 1.0)},
+        constants={name: {"unit": u, "value": v} for name, (u, v) in constants.items()},
+        energy={"kinetic": kinetic, "potential": "q0*s"},
     )
     text = describe_equations(rail)
     assert "M[s,s] = mass p0" in text
@@ -73,7 +61,7 @@ def test_names_of_constants_may_be_those_of_internal_symbols():
 
 
 def test_a_wrong_device_is_an_input_error():
-    rail = make_rail(energy={"kinetic": "maas*ddt(s)**2/2"})
+    rail = made_up_device("maas*ddt(s)**2/2", {"s": "force_x"}, {"mass": ("kg", 2.0, 1.0)})
     with pytest.raises(InputError, match="did you mean 'mass'"):
         describe_equations(rail)
 

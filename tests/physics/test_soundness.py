@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from motions import made_up_device, made_up_effect
 
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
@@ -10,18 +11,13 @@ from bampipe.physics.soundness import require_sound
 
 def arm(rotor: float):
     """A slider on a turning arm: no inertia about the pivot where the slider is at it."""
-    return registry.device_from(
-        {
-            "name": "arm",
-            "coordinates": {"angle": {"kind": "rotary"}, "reach": {"kind": "linear"}},
-            "constants": {"I": {"value": rotor, "unit": "kg.m2", "source": "assumed"}},
-            "energy": {
-                "kinetic": "(mass*(reach**2*ddt(angle)**2 + ddt(reach)**2) + I*ddt(angle)**2)/2"
-            },
-            "inputs": {"force": ["force_x", "force_z"]},
-            "applied": {"angle": "reach*force_x", "reach": "force_z"},
-            "parameters": {"mass": {"unit": "kg", "prior": 2.0, "sd": 1.0}},
-        }
+    return made_up_device(
+        "(mass*(reach**2*ddt(angle)**2 + ddt(reach)**2) + I*ddt(angle)**2)/2",
+        {"angle": "reach*force_x", "reach": "force_z"},
+        {"mass": ("kg", 2.0, 1.0)},
+        coordinates={"angle": {"kind": "rotary"}, "reach": {"kind": "linear"}},
+        constants={"I": {"value": rotor, "unit": "kg.m2", "source": "assumed"}},
+        inputs={"force": ["force_x", "force_z"]},
     )
 
 
@@ -63,18 +59,9 @@ def test_the_manipulator_has_inertia_everywhere(pose):
 
 
 def test_the_effect_that_gives_no_number_is_named():
-    effect = registry.effect_from(
-        {
-            "name": "hollow",
-            "summary": "a root of a negative number beyond 0.5 m",
-            "scope": "axis",
-            "kind": "torque",
-            "looks_like": "nothing until it is gone",
-            "source": "made up",
-            "torque": "-size*sqrt(0.5 - reach)",
-            "parameters": {"size": {"unit": "N", "prior": 1.0, "sd": 1.0}},
-        }
-    )
+    text = "-size*sqrt(0.5 - reach)"  # of a negative number beyond 0.5 m
+    size = {"size": ("N", 1.0, 1.0)}
+    effect = made_up_effect("axis", "torque", size, torque=text, name="hollow")
     model = Model(arm(0.01), ("return_spring:angle", "hollow:reach"), (effect,))
     system = compile_model(model)
     check(system, np.linspace(0.1, 0.4, 4))

@@ -71,13 +71,6 @@ def full(full_run: Path) -> Report:
     return build_run_report(Results(full_run), quiet)
 
 
-@pytest.fixture(scope="module")
-def bare(tmp_path_factory: pytest.TempPathFactory) -> Report:
-    root = tmp_path_factory.mktemp("runs") / "s02"
-    synthetic_run.write_ingest(root)
-    return build_run_report(Results(root), quiet)
-
-
 def test_sections_stand_in_order_and_the_summary_gives_the_key_numbers(full: Report) -> None:
     assert full.sections[0] == "Summary"
     assert full.sections[-1] == "Provenance"
@@ -217,6 +210,13 @@ def test_provenance_lists_inputs_versions_and_keys_in_order(full: Report) -> Non
     assert places == sorted(places)
 
 
+def test_a_device_of_no_paper_mentions_none(own_run: Path, full: Report) -> None:
+    assert "the paper's" in text_of(full.html)
+    path = own_run / "ingest/session.json"
+    path.write_text(path.read_text().replace('"bam"', '"slider"'))
+    assert "the paper's" not in text_of(page_of(own_run))
+
+
 def test_settings_that_all_models_share_stand_once(own_run: Path) -> None:
     record = json.loads((own_run / "run.json").read_text())
     stages = record["stages"]
@@ -312,7 +312,9 @@ def test_pdf_text_and_pages(full: Report, tmp_path: Path) -> None:
     assert all(len(page.split()) > 40 for page in pages)
 
 
-def test_what_was_not_done_is_said_with_its_command(bare: Report) -> None:
+def test_what_was_not_done_is_said_with_its_command(tmp_path: Path) -> None:
+    synthetic_run.write_ingest(tmp_path / "s02")
+    bare = build_run_report(Results(tmp_path / "s02"), quiet)
     words = text_of(bare.html)
     for command in ("filter", "stiffness", "identify", "validate", "diagnose"):
         assert f"bampipe {command} s02" in words

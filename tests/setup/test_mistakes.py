@@ -20,7 +20,7 @@ from bampipe.results.setup import SetupResult
 
 NAMED = [
     ("joint", "degrees for radians"),
-    ("joint", "motor constant left at 1"),
+    pytest.param("joint", "motor constant left at 1", marks=pytest.mark.long),
     ("axis", "clock and rate in milliseconds"),
     ("damper", "force and current exchanged"),
     ("bam", "encoder of the pitch reversed"),
@@ -39,16 +39,16 @@ def test_both_are_given_where_one_axis_cannot_tell_encoder_from_force() -> None:
     assert found.verdict == "tied" and found.beside == 0, found.line()
 
 
-@pytest.mark.parametrize("mistake", ["clock in milliseconds for seconds", "metres for millimetres"])
-def test_what_ingest_sees_is_said_by_ingest(mistake: str) -> None:
-    assert run_case(Case("axis", mistake, 31)).verdict == "read"
+def test_what_ingest_sees_is_said_by_ingest() -> None:
+    """Of time, `test_bad_sessions` says it."""
+    assert run_case(Case("axis", "metres for millimetres", 31)).verdict == "read"
 
 
 @pytest.mark.parametrize(
     ("machine", "effect"),
     [
         ("joint", "load_dependent_friction:joint"),
-        ("axis", "flexible_load:carriage"),
+        pytest.param("axis", "flexible_load:carriage", marks=pytest.mark.long),
         # A third of the torque about the pitch is left: other set-ups are tried, and none is right.
         ("bam", "gravity_compensator_lag"),
     ],
@@ -124,19 +124,14 @@ def test_a_device_without_a_scale_is_refused(tmp_path: Path) -> None:
         inspected(tmp_path, free, used)
 
 
-@pytest.fixture(scope="module")
-def reversed_joint(tmp_path_factory: pytest.TempPathFactory) -> bampipe.Run:
-    root = tmp_path_factory.mktemp("reversed")
-    independent.record("joint", root / "session", 31, {}, mistakes.SHORT["joint"])
-    MISTAKES["joint"]["encoder reversed"].spoil(root / "session")
+def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
+    tmp_path: Path,
+) -> None:
+    independent.record("joint", tmp_path / "session", 31, {}, mistakes.SHORT["joint"])
+    MISTAKES["joint"]["encoder reversed"].spoil(tmp_path / "session")
     stages = '["ingest", "filter", "identify", "validate", "report"]'
     pipeline = mistakes.PIPELINE.replace('["ingest", "filter"]', stages)
-    return run_short(root / "session", root, pipeline)
-
-
-def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
-    reversed_joint: bampipe.Run,
-) -> None:
+    reversed_joint = run_short(tmp_path / "session", tmp_path, pipeline)
     (mistake,) = SetupResult.read(reversed_joint.root / "filter/setup.json").mistakes
     assert mistake.axes == ("joint",)
     assert mistake.error_before["joint"] > 50.0
@@ -156,7 +151,7 @@ def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
 @pytest.mark.parametrize(
     ("machine", "column", "factors", "named"),
     [
-        ("joint", "q", (1, -1, 1, 1), "t02: joint"),
+        pytest.param("joint", "q", (1, -1, 1, 1), "t02: joint", marks=pytest.mark.long),
         pytest.param(
             "axis", "u", (1, -1, -1, 1), "t02 and t03: carriage or force_motor",
             marks=pytest.mark.long,

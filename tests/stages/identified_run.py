@@ -1,12 +1,11 @@
-"""Run folders up to the filter stage, simulated or from a shared session."""
+"""Run folders up to the filter stage, simulated or recorded."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from run_folders import SESSIONS, ingested_session, write_ingested
+from run_folders import write_ingested
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.files import write_text
@@ -70,25 +69,11 @@ def simulated_run(
     return _filtered(write_ingested(root, frames, dict.fromkeys(frames, ("free", None)), AXES))
 
 
-def shared_run(root: Path, name: str) -> RunFolder:
-    """Take the shared session ``name`` up to the filter stage; skip where it is absent."""
-    return _filtered(ingested_session(root, name))
-
-
 def recorded_run(root: Path, session: Path) -> RunFolder:
     """Take the session in a folder up to the filter stage."""
     run = RunFolder(root)
     ingest.execute(run, root, ingest.Config(session=str(session)), silent)
     return _filtered(run)
-
-
-def session_truth(name: str) -> dict[str, float]:
-    """Return the true parameters of the shared session ``name``."""
-    truth = json.loads((SESSIONS / f"{name}.truth.json").read_text())
-    values = {"mass": truth["mass"]}
-    for i, axis in enumerate(RESOLUTION):
-        values[f"viscous.{axis}"], values[f"coulomb.{axis}"] = truth["kd"][i], truth["fc"][i]
-    return values
 
 
 def _filtered(run: RunFolder) -> RunFolder:

@@ -4,7 +4,6 @@ import copy
 import datetime
 import json
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -118,16 +117,6 @@ def toml_text(value: Any) -> str:
     return "".join(f"{json.dumps(key)} = {inline(item)}\n" for key, item in value.items())
 
 
-@cache
-def _sound() -> dict[str, tuple[dict[str, np.ndarray], bytes]]:
-    tables = {
-        "trials/t01.csv": free_trial(1),
-        "trials/t02.parquet": free_trial(2),
-        "trials/t03.parquet": locked_trial(),
-    }
-    return {name: (table, _as_file(name, table)) for name, table in tables.items()}
-
-
 def parquet(table: dict[str, np.ndarray]) -> bytes:
     """The table as a Parquet file, which is read in a hundredth of the time of a CSV."""
     return pd.DataFrame(table).to_parquet()
@@ -137,15 +126,6 @@ def _as_file(name: str, table: dict[str, np.ndarray]) -> bytes:
     return parquet(table) if name.endswith(".parquet") else csv_text(table).encode()
 
 
-def _content(name: str, table: dict[str, np.ndarray]) -> bytes:
-    """The file of a table, from memory where nothing was changed."""
-    sound, content = _sound().get(name, ({}, b""))
-    same = list(sound) == list(table) and all(
-        np.array_equal(sound[column], table[column]) for column in table
-    )
-    return content if same else _as_file(name, table)
-
-
 @dataclass
 class Made:
     """A session to damage before it is written: settings, tables, and files byte by byte."""
@@ -153,19 +133,21 @@ class Made:
     session: dict[str, Any] = field(default_factory=lambda: copy.deepcopy(SESSION))
     tables: dict[str, dict[str, np.ndarray]] = field(
         default_factory=lambda: {
-            name: copy.deepcopy(table) for name, (table, _) in _sound().items()
+            "trials/t01.csv": free_trial(1),
+            "trials/t02.parquet": free_trial(2),
+            "trials/t03.parquet": locked_trial(),
         }
     )
     files: dict[str, bytes | str] = field(default_factory=dict)
 
     def text(self, name: str = "trials/t01.csv") -> str:
-        return _content(name, self.tables[name]).decode()
+        return _as_file(name, self.tables[name]).decode()
 
     def write(self, root: Path) -> Path:
         """Write the session below ``root``; ``files`` take the place of what was made."""
         contents: dict[str, bytes | str] = {
             "session.toml": toml_text(self.session),
-            **{name: _content(name, table) for name, table in self.tables.items()},
+            **{name: _as_file(name, table) for name, table in self.tables.items()},
             **self.files,
         }
         for name, content in contents.items():

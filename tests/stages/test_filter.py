@@ -1,11 +1,11 @@
-"""The filter stage on simulated and shared sessions."""
+"""The filter stage on simulated sessions."""
 
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from run_folders import ingested_session, write_ingested
+from run_folders import write_ingested
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
@@ -194,17 +194,6 @@ def test_trials_that_are_too_few_or_too_short_are_said_with_their_size(tmp_path:
     run = write_ingested(tmp_path / "run", frames, dict.fromkeys(frames, ("free", "")), AXES)
     summary = stage.execute(run, run.root, configure("filter", {}), silent)
     assert summary["notes"] == ["b: not used: 31 sound samples, of which 32 are needed"]
-
-
-def test_shared_session(tmp_path: Path) -> None:
-    content, kinematics = run_stage(ingested_session(tmp_path / "open-09", "open-09"))
-    assert kinematics["trial_id"].nunique() == 8
-    assert kinematics.notna().all(axis=None)
-    for axis, entry in content["axes"].items():
-        assert 20.0 <= entry["bandwidth_hz"] <= 40.0
-        assert entry["measurement_noise_sd"] < 1.3 * entry["quantisation_sd"]
-        slope = np.gradient(kinematics[f"q_{axis}"], 0.002)
-        assert np.corrcoef(slope[10:7990], kinematics[f"qd_{axis}"][10:7990])[0, 1] > 0.999
 
 
 def test_of_very_many_trials_some_choose_the_bandwidth(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The identify stage on simulated and shared sessions."""
+"""The identify stage on simulated sessions."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import schema_misfits
-from identified_run import MODEL, RESOLUTION, TRUTH, session_truth, shared_run, simulated_run
+from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
@@ -53,18 +53,6 @@ def assert_recovered(content: dict, truth: dict[str, float]) -> None:
     for name, value in truth.items():
         estimate = content["parameters"][name]["estimate"]
         assert estimate == pytest.approx(value, rel=TOLERANCE[name.split(".")[0]]), name
-
-
-@pytest.mark.parametrize("name", ["open-01", pytest.param("open-09", marks=pytest.mark.long)])
-def test_shared_sessions_within_what_is_asked(tmp_path: Path, name: str) -> None:
-    run = shared_run(tmp_path / name, name)
-    content = identified(run)
-    assert_recovered(content, session_truth(name))
-    assert content["convergence"]["converged"]
-    assert 0.7 < content["nis"]["mean"] < 1.4
-    for name_, value in session_truth(name).items():
-        entry = content["parameters"][name_]
-        assert abs(entry["estimate"] - value) < 6.0 * entry["sd"], name_
 
 
 def test_intervals_hold_on_a_simulated_session(published: tuple[Path, dict]) -> None:
@@ -180,9 +168,10 @@ def test_a_model_with_a_delay_gets_no_timing_of_its_own(simulated: RunFolder) ->
 def test_the_force_noise_moves_the_encoder_of_an_axis_that_winds_up(tmp_path: Path) -> None:
     """Without that in the noise of the readings, the filter gave the friction as 14 for 4.2."""
     name = "transmission_compliance.yaw.compliance"
-    run = simulated_run(tmp_path, effect="transmission_compliance:yaw", hidden={name: 2e-3})
-    wound = MODEL.replace("[]", '["transmission_compliance:yaw"]')
-    write_text(run.path("models/base/model.toml"), wound)
+    wound = {"effect": "transmission_compliance:yaw", "hidden": {name: 2e-3}}
+    run = simulated_run(tmp_path, seconds=6.0, **wound)
+    text = MODEL.replace("[]", '["transmission_compliance:yaw"]')
+    write_text(run.path("models/base/model.toml"), text)
     content = identified(run, replace(FAST, method="ukf"))
     assert_recovered(content, TRUTH)
     assert content["parameters"][name]["estimate"] == pytest.approx(2e-3, rel=5e-3)

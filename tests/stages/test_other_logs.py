@@ -41,7 +41,6 @@ schema = "bampipe.session/1"
 session_id = "arm"
 device = "joint.toml"
 sample_rate_hz = {rate}
-{more}
 [time]
 {time}
 [encoders]
@@ -61,13 +60,13 @@ I = 1.2 * np.sin(3 * T)  # noqa: E741
 
 
 def ingested(
-    folder: Path, text: str, *, time: str, encoder: str, current: str, more: str = "", rate=RATE
+    folder: Path, text: str, *, time: str, encoder: str, current: str
 ) -> tuple[pd.DataFrame, pd.Series, dict]:
     """Samples, the trial's row and session.json of a session over one log."""
     folder.mkdir(exist_ok=True)
     (folder / "joint.toml").write_text(DEVICE)
     (folder / "log.csv").write_text(text)
-    session = HEAD.format(rate=rate, time=time, encoder=encoder, current=current, more=more)
+    session = HEAD.format(rate=RATE, time=time, encoder=encoder, current=current)
     (folder / "session.toml").write_text(session)
     out = folder / "out"
     ingest.execute(RunFolder(out), out, ingest.Config(session=str(folder)), silent)
@@ -218,12 +217,6 @@ def test_units_that_contradict_the_file_are_refused(tmp_path, change, said):
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_the_layout_that_a_session_declares(tmp_path):
-    text = "".join(f"{t:.6f} {q:.6f} {i:.6f}\n" for t, q, i in zip(T, Q, I, strict=True))
-    more = '[csv]\nnames = ["t", "q", "i"]'
-    check(ingested(tmp_path, text, time='column = "t"\nunit = "s"', more=more, **PLAIN)[0])
-
-
 @pytest.mark.parametrize(
     ("text", "si", "scale"),
     [
@@ -239,6 +232,9 @@ def test_the_layout_that_a_session_declares(tmp_path):
         ("oz-in", "N.m", 7.0615518e-3), ("ft-lb", "N.m", 1.3558179), ("rad s^-1", "rad/s", 1.0),
         ("degrees per second", "rad/s", np.pi / 180), ("m·s⁻²", "m/s2", 1.0),
         ("0.229rpm", "rad/s", 0.229 * np.pi / 30), ("deg/10", "rad", np.pi / 1800),
+        ("U/min", "rad/s", np.pi / 30), ("gon", "rad", np.pi / 200), ("daN", "N", 10.0),
+        ("grados", "rad", np.pi / 180), ("10^-3 s", "s", 1e-3), ("NM", "N.m", 1.0),
+        ("N・m", "N.m", 1.0),
     ],
 )  # fmt: skip
 def test_units_of_logs(text, si, scale):

@@ -271,7 +271,7 @@ def test_reductions_of_a_device_file_beside_the_logs_are_taken(tmp_path: Path) -
     assert proposal.device == ""
 
 
-@pytest.mark.parametrize("gain", [0.01, 1.0])
+@pytest.mark.parametrize("gain", [0.01, pytest.param(1.0, marks=pytest.mark.long)])
 def test_many_radians_of_a_motor_are_no_degrees_though_these_stay_in_the_range(
     tmp_path: Path, gain: float
 ) -> None:

@@ -55,10 +55,10 @@ TRUTH = {"M": 1.3, "ml": 0.12, "J": 0.06, "viscous.cart": 6.0, "coulomb.cart": 2
 
 
 def log(seed: int) -> np.ndarray:
-    """Time, position, angle and force, 12 s at 200 Hz, integrated by Euler steps of 0.25 ms."""
+    """Time, position, angle and force, 8 s at 200 Hz, integrated by Euler steps of 0.25 ms."""
     rng = np.random.default_rng(seed)
     dt, rows = 2.5e-4, []
-    t = np.arange(0.0, 12.0, dt)
+    t = np.arange(0.0, 8.0, dt)
     tones = 2 * np.pi * rng.uniform(0.1, 1.2, 4)
     goal = (0.15 * np.sin(tones * t[:, None] + rng.uniform(0, 6, 4)) / (0.6 + tones / 4)).sum(1)
     x, angle, v, w = float(goal[0]), 0.3, 0.0, 0.0

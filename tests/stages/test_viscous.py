@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 from identified_run import recorded_run
 from independent_runs import record_run
-from run_folders import SESSIONS
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet, write_parquet
@@ -138,13 +137,3 @@ def test_performance_at_the_handle(run: RunFolder) -> None:
     assert handle["inertia"]["upper"] >= mass * 0.999
     assert content["constants"]["L"]["source"] == "Table II"
     assert "stiffness" not in handle
-
-
-@pytest.mark.long
-def test_the_shared_session_renders_what_was_commanded(tmp_path: Path) -> None:
-    if not (SESSIONS / "open-09").is_dir():
-        pytest.skip("the shared sessions are not here")
-    directions = found(identified(tmp_path, SESSIONS / "open-09"))["directions"]
-    for name, entry in directions.items():
-        assert entry["estimate"] == pytest.approx(40.0, rel=0.01), name
-        assert not entry["differs"], name
