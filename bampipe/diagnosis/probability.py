@@ -141,8 +141,7 @@ def weigh_sets(
         if unknown[axis] == unknown.max():
             sets = with_unknown
     excess = _compute_excess(costs)
-    sets = _add_unknown(sets, int(np.argmax(excess)), float(excess.max()))
-    unknown = np.maximum(unknown, excess)
+    sets, unknown = _add_unknown(sets, excess), np.maximum(unknown, excess)
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
     for effect in own if doubtful.any() else ():
         # A doubtful effect is not absent: the model keeps it, and the report mentions it.
@@ -166,13 +165,14 @@ def _compute_excess(costs: SetCosts) -> Array:
     return np.asarray(ndtr(log_scale * np.sqrt(2.0 * p.independent)))
 
 
-def _add_unknown(sets: Sequence[SetEvidence], axis: int, least: float) -> tuple[SetEvidence, ...]:
-    """Return the sets where something unknown has at least the probability ``least``.
+def _add_unknown(sets: Sequence[SetEvidence], excess: Array) -> tuple[SetEvidence, ...]:
+    """Return the sets where something unknown has at least the largest probability of ``excess``.
 
-    Of its form nothing is known, so that it is as probable on ``axis`` beside any set without it.
+    Of its form nothing is known, so that it is as probable beside any set without it.
     """
+    axis = int(np.argmax(excess))
     none = sum(s.probability for s in sets if s.unknown is None)
-    share = max(0.0, 1.0 - (1.0 - least) / max(none, 1e-300))
+    share = max(0.0, 1.0 - (1.0 - float(excess[axis])) / max(none, 1e-300))
     beside = {s.effects: s for s in sets if s.unknown == axis}
     rest = [s for s in sets if s.unknown not in (None, axis)]
     for one in (s for s in sets if s.unknown is None):
