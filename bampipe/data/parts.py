@@ -3,7 +3,7 @@
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal, cast
@@ -27,6 +27,10 @@ _SAME_STAMP = 0.6
 """Of a step: how far stamps of two clocks of the same samples may be apart."""
 _OVERLAP = 0.5
 """Share of the shorter part that both must have in common on one clock."""
+_TOO_FEW = 100
+"""Samples of one part for one of another, beyond which nothing between those is known."""
+_FEWEST_STAMPS = 20
+"""Of a file of times that tell the length of a recording."""
 _SAME_LENGTH = 0.2
 """Share by which lengths may differ of parts whose clocks are taken to start together."""
 
@@ -36,15 +40,27 @@ class FileClock:
     """The time of one file.
 
     Attributes:
-        samples: how many it has; column: its time column, "" where there is none; unit: of that.
+        samples: how many it has; column: its time column, "" where there is none; unit: of that;
+            stated: whether the file gives it.
         t: (T,) s; start: its first stamp, s, on a clock that files may share.
     """
 
     samples: int
     column: str = ""
     unit: str = ""
+    stated: bool = True
     t: np.ndarray | None = None
     start: float = 0.0
+
+    def beside(self, other: "FileClock") -> "FileClock":
+        """This clock in the unit in which it lasts as long as another, if the file states none."""
+        if self.stated or self.t is None or other.t is None or _last_alike(self.t, other.t):
+            return self
+        for unit, size in SECONDS.items():
+            factor = size / SECONDS.get(self.unit, 1.0)
+            if _last_alike(factor * self.t, other.t):
+                return replace(self, unit=unit, t=factor * self.t, start=factor * self.start)
+        return self
 
 
 def join_parts(
@@ -101,6 +117,8 @@ def join_parts(
             try:
                 parts.append(_part(main, other, called[other], clock(main), clock(other)))
             except InputError as error:
+                if roles[other] == {"time"}:
+                    _refuse_flat(main, other, clock(main).samples, clock(other).samples)
                 reasons.append(str(error))
                 continue
             alike |= set(found[other]) & set(found[main]) - {clock(main).column}
@@ -132,8 +150,22 @@ def _called(words: Sequence[str], own: frozenset[str], said: Sequence[str]) -> s
     return name[:_LONGEST] if re.match("[a-z]", name) else f"part_{name}".rstrip("_")[:_LONGEST]
 
 
+def _refuse_flat(main: str, times: str, rows: int, stamps: int) -> None:
+    """Refuse a file that has several rows for each time of another."""
+    turns, rest = divmod(rows, stamps)
+    if turns > 1 and rest == 0 and stamps > _FEWEST_STAMPS:
+        raise InputError(
+            f"{rows} rows, {turns} for each of the {stamps} times in {times}: {turns} quantities"
+            " in one column?",
+            where=main,
+            remedy=f"write a column each: numpy.loadtxt(FILE).reshape(-1, {turns}) where they take"
+            f" turns, .reshape({turns}, -1).T where one is below the other",
+        )
+
+
 def _part(main: str, other: str, called: str, first: FileClock, second: FileClock) -> Part:
     """How ``other`` is joined to ``main``; InputError where neither length nor clock says how."""
+    second = second.beside(first)
     counts = sorted((first.samples, second.samples))
     rows = counts[1] - counts[0] <= max(1, MOST_APART * counts[1])
     join: Literal["rows", "time", "start", ""] = "rows" if rows else ""
@@ -145,8 +177,15 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
         overlap = min(ends) - max(first.start, second.start)
         spans = sorted((float(first.t[-1]), float(second.t[-1])))
         if not same:
-            alike = spans[0] >= (1.0 - _SAME_LENGTH) * spans[1]
+            alike = _last_alike(first.t, second.t)
             join = "time" if overlap >= _OVERLAP * spans[0] else "start" if alike else ""
+            if join and _TOO_FEW * counts[0] < counts[1]:
+                raise InputError(
+                    f"{second.samples} samples, where {main} has {first.samples}: too few to"
+                    " interpolate between",
+                    where=other,
+                    remedy="if it is a command in steps, write it at the rate of the other",
+                )
     if not join:
         raise InputError(
             f"{second.samples} samples, where {main} has {first.samples}, and no clock in common",
@@ -161,6 +200,12 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
         time=second.column if timed and second.column != first.column else "",
         time_unit=cast(TimeUnit, second.unit) if timed and second.unit != first.unit else "",
     )
+
+
+def _last_alike(t: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two clocks, (T,) s from 0 each, last equally long."""
+    shorter, longer = sorted((float(t[-1]), float(other[-1])))
+    return shorter >= (1.0 - _SAME_LENGTH) * longer
 
 
 def _read_clock(
@@ -179,5 +224,6 @@ def _read_clock(
             unit = guesses.time_unit(stamps, columns[column])
             tick = SECONDS.get(unit, 1.0)
             start = raw.since.get(column, 0) / NANOSECONDS or float(known[0]) * tick
-            return FileClock(len(raw), column, unit, (stamps - known[0]) * tick, start)
+            stated = bool(columns[column])
+            return FileClock(len(raw), column, unit, stated, (stamps - known[0]) * tick, start)
     return FileClock(len(raw))

@@ -120,12 +120,13 @@ def inspect_setup(
 
 
 def _describe_travel(system: System, session: IngestResult, motions: Sequence[Motion]) -> list[str]:
-    """Report axes that move implausibly far, as if degrees were taken for radians."""
+    """Report axes that move implausibly far, as if degrees were taken for radians unstated."""
     travel = np.max([np.ptp(motion.q, axis=0) for motion in motions], axis=0)
     found = []
     for coordinate, size in zip(system.model.device.coordinates, travel, strict=True):
         most, meant = _FARTHEST[coordinate.kind]
-        if size > most and session.axes[coordinate.name].raw_unit == coordinate.unit:
+        axis = session.axes[coordinate.name]
+        if size > most and axis.raw_unit == coordinate.unit and not axis.unit_in_log:
             found.append(
                 f"{coordinate.name} moves through {size:.3g} {coordinate.unit}: is its position in"
                 f" {meant}?"

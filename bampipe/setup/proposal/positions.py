@@ -89,6 +89,22 @@ def fresh_readings(found: Survey, notes: Notes) -> Survey:
     return replace(found, columns=columns)
 
 
+def without_copies(found: Survey, notes: Notes) -> Survey:
+    """The log in which no position in another unit passes for what drives the motion."""
+    positions = [c for c in found.of("position") if not c.is_constant]
+    copied = {
+        c.name: position.name
+        for c in found.of(*DRIVERS)
+        for position in positions
+        if guesses.is_copy(c.values, position.values)
+    }
+    notes.check += [
+        f"{c} repeats {of} in another unit, and drives nothing" for c, of in copied.items()
+    ]
+    columns = (replace(c, role="reference") if c.name in copied else c for c in found.columns)
+    return replace(found, columns=tuple(columns))
+
+
 def signed_readings(found: Survey) -> tuple[Survey, dict[str, Register]]:
     """The log with its registers as signed numbers, and how each of them holds its sign.
 
