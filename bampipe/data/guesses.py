@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,32 +122,17 @@ def is_copy(values: np.ndarray, of: np.ndarray) -> bool:
     return bool(1.0 - float(np.corrcoef(x, y)[0, 1]) ** 2 < _COPIED**2)
 
 
-def quantities_in_turn(values: np.ndarray) -> int:
-    """How many quantities stand in one column (T,) in turn, 1 where it does not look like that.
+def take_turns(values: np.ndarray, keys: Sequence[np.ndarray]) -> bool:
+    """Whether several quantities stand in one column (T,) in turn.
 
-    A reading leaps to the next one, and goes on where its quantity has its turn again.
+    Readings leap from row to row, but not between rows with one of a key (T,), or every so many.
     """
-    leaps = _leaps(values)
-    if leaps == 0.0:
-        return 1
-    turns = range(2, _MOST_IN_TURN + 1)
-    steps = (float(np.mean((values[n:] - values[:-n]) ** 2)) for n in turns)
-    return next((n for n, x in zip(turns, steps, strict=True) if x < _GOES_ON**2 * leaps), 1)
-
-
-def take_turns(values: np.ndarray, key: np.ndarray) -> bool:
-    """Whether readings (T,) leap from row to row, and not between rows with one ``key`` (T,)."""
-    leaps = _leaps(values)
-    in_order = values[np.argsort(key, kind="stable")]
-    return leaps > 0.0 and float(np.mean(np.diff(in_order) ** 2)) < _GOES_ON**2 * leaps
-
-
-def _leaps(values: np.ndarray) -> float:
-    """Mean square of the changes from row to row (T,), 0 where a motion may have made them."""
-    if len(values) < 10 * _MOST_IN_TURN or not np.all(np.isfinite(values)):
-        return 0.0
-    leaps = float(np.mean(np.diff(values) ** 2))
-    return leaps if leaps > 2.0 * _LEAPS * float(np.var(values)) else 0.0
+    leaps = float(np.mean(np.diff(values) ** 2)) if len(values) > 10 * _MOST_IN_TURN else 0.0
+    if not leaps > 2.0 * _LEAPS * float(np.var(values)):
+        return False
+    rows, turns = np.arange(len(values)), range(2, _MOST_IN_TURN + 1)
+    orders = (np.argsort(key, kind="stable") for key in (*keys, *(rows % n for n in turns)))
+    return any(np.mean(np.diff(values[each]) ** 2) < _GOES_ON**2 * leaps for each in orders)
 
 
 @dataclass(frozen=True)

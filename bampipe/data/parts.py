@@ -3,8 +3,7 @@
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
@@ -29,8 +28,6 @@ _OVERLAP = 0.5
 """Share of the shorter part that both must have in common on one clock."""
 _TOO_FEW = 100
 """Samples of one part for one of another, beyond which nothing between those is known."""
-_FEWEST_STAMPS = 20
-"""Of a file of times that tell the length of a recording."""
 _SAME_LENGTH = 0.2
 """Share by which lengths may differ of parts whose clocks are taken to start together."""
 
@@ -40,27 +37,15 @@ class FileClock:
     """The time of one file.
 
     Attributes:
-        samples: how many it has; column: its time column, "" where there is none; unit: of that;
-            stated: whether the file gives it.
+        samples: how many it has; column: its time column, "" where there is none; unit: of that.
         t: (T,) s; start: its first stamp, s, on a clock that files may share.
     """
 
     samples: int
     column: str = ""
     unit: str = ""
-    stated: bool = True
     t: np.ndarray | None = None
     start: float = 0.0
-
-    def beside(self, other: "FileClock") -> "FileClock":
-        """This clock in the unit in which it lasts as long as another, if the file states none."""
-        if self.stated or self.t is None or other.t is None or _last_alike(self.t, other.t):
-            return self
-        for unit, size in SECONDS.items():
-            factor = size / SECONDS.get(self.unit, 1.0)
-            if _last_alike(factor * self.t, other.t):
-                return replace(self, unit=unit, t=factor * self.t, start=factor * self.start)
-        return self
 
 
 def join_parts(
@@ -96,11 +81,6 @@ def join_parts(
         words = (w for w in _words(name) if w not in said[name] and w not in own[kind])
         groups[tuple(words)].append(name)
     trials, reasons = [], []
-
-    @cache
-    def clock(name: str) -> FileClock:
-        return _read_clock(folder, name, found[name], role, dialect)
-
     for names in groups.values():
         if len({kinds[name] for name in names}) != len(names) or len(names) < 2:
             continue
@@ -111,17 +91,25 @@ def join_parts(
         roles = {n: {role(f"{called[n]}:{c}", u) for c, u in found[n].items()} for n in names}
         main = max(names, key=lambda n: ("position" in roles[n], -names.index(n)))
         parts, alike = [], set()
+        own_clock = _read_clock(folder, main, found[main], role, dialect)
         for other in names:
             if other == main:
                 continue
+            clock = _read_clock(folder, other, found[other], role, dialect, own_clock)
             try:
-                parts.append(_part(main, other, called[other], clock(main), clock(other)))
+                parts.append(_part(main, other, called[other], own_clock, clock))
             except InputError as error:
-                if roles[other] == {"time"}:
-                    _refuse_flat(main, other, clock(main).samples, clock(other).samples)
+                turns, rest = divmod(own_clock.samples, clock.samples)
+                if roles[other] == {"time"} and turns > 1 and rest == 0:
+                    raise InputError(
+                        f"{turns} rows for each time in {other}: {turns} axes in one column?",
+                        where=main,
+                        remedy=f"write a column for each: .reshape(-1, {turns}) where they take"
+                        f" turns, .reshape({turns}, -1).T where one is below the other",
+                    ) from error
                 reasons.append(str(error))
                 continue
-            alike |= set(found[other]) & set(found[main]) - {clock(main).column}
+            alike |= set(found[other]) & set(found[main]) - {own_clock.column}
         if parts:
             named = called[main] if alike else ""
             trials.append(TrialEntry(file=main, kind="free", part=named, parts=tuple(parts)))
@@ -150,22 +138,8 @@ def _called(words: Sequence[str], own: frozenset[str], said: Sequence[str]) -> s
     return name[:_LONGEST] if re.match("[a-z]", name) else f"part_{name}".rstrip("_")[:_LONGEST]
 
 
-def _refuse_flat(main: str, times: str, rows: int, stamps: int) -> None:
-    """Refuse a file that has several rows for each time of another."""
-    turns, rest = divmod(rows, stamps)
-    if turns > 1 and rest == 0 and stamps > _FEWEST_STAMPS:
-        raise InputError(
-            f"{rows} rows, {turns} for each of the {stamps} times in {times}: {turns} quantities"
-            " in one column?",
-            where=main,
-            remedy=f"write a column each: numpy.loadtxt(FILE).reshape(-1, {turns}) where they take"
-            f" turns, .reshape({turns}, -1).T where one is below the other",
-        )
-
-
 def _part(main: str, other: str, called: str, first: FileClock, second: FileClock) -> Part:
     """How ``other`` is joined to ``main``; InputError where neither length nor clock says how."""
-    second = second.beside(first)
     counts = sorted((first.samples, second.samples))
     rows = counts[1] - counts[0] <= max(1, MOST_APART * counts[1])
     join: Literal["rows", "time", "start", ""] = "rows" if rows else ""
@@ -177,18 +151,13 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
         overlap = min(ends) - max(first.start, second.start)
         spans = sorted((float(first.t[-1]), float(second.t[-1])))
         if not same:
-            alike = _last_alike(first.t, second.t)
+            alike = _alike(*spans)
             join = "time" if overlap >= _OVERLAP * spans[0] else "start" if alike else ""
-            if join and _TOO_FEW * counts[0] < counts[1]:
-                raise InputError(
-                    f"{second.samples} samples, where {main} has {first.samples}: too few to"
-                    " interpolate between",
-                    where=other,
-                    remedy="if it is a command in steps, write it at the rate of the other",
-                )
+            join = join if counts[1] < _TOO_FEW * counts[0] else ""
     if not join:
         raise InputError(
-            f"{second.samples} samples, where {main} has {first.samples}, and no clock in common",
+            f"{second.samples} samples, where {main} has {first.samples}: too few, or no clock in"
+            " common",
             where=other,
             remedy="are they one recording? export them at one rate, or each with its time",
         )
@@ -202,15 +171,19 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
     )
 
 
-def _last_alike(t: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two clocks, (T,) s from 0 each, last equally long."""
-    shorter, longer = sorted((float(t[-1]), float(other[-1])))
-    return shorter >= (1.0 - _SAME_LENGTH) * longer
+def _alike(*lengths: float) -> bool:
+    return min(lengths) >= (1.0 - _SAME_LENGTH) * max(lengths)
 
 
 def _read_clock(
-    folder: Path, name: str, columns: Columns, role: Callable[[str, str], str], dialect: Dialect
+    folder: Path,
+    name: str,
+    columns: Columns,
+    role: Callable[[str, str], str],
+    dialect: Dialect,
+    beside: FileClock | None = None,
 ) -> FileClock:
+    """The clock of a file, in the unit in which it lasts as long as one ``beside`` if unstated."""
     times = [column for column, unit in columns.items() if role(column, unit) == "time"]
     datetimes = {column: "" for column in times if columns[column] == "datetime"}
     wanted = times or list(columns)[:1]
@@ -221,9 +194,11 @@ def _read_clock(
         stamps = raw.columns[column]
         known = stamps[np.isfinite(stamps)]
         if len(known) > 1 and float(np.mean(np.diff(known) > 0)) > 0.9 and len(known) == len(raw):
-            unit = guesses.time_unit(stamps, columns[column])
+            unit, length = guesses.time_unit(stamps, columns[column]), float(known[-1] - known[0])
+            if beside is not None and beside.t is not None and not columns[column]:
+                sizes = {u: SECONDS[u] * length for u in (unit, *SECONDS) if u in SECONDS}
+                unit = next((u for u, x in sizes.items() if _alike(x, beside.t[-1])), unit)
             tick = SECONDS.get(unit, 1.0)
             start = raw.since.get(column, 0) / NANOSECONDS or float(known[0]) * tick
-            stated = bool(columns[column])
-            return FileClock(len(raw), column, unit, stated, (stamps - known[0]) * tick, start)
+            return FileClock(len(raw), column, unit, (stamps - known[0]) * tick, start)
     return FileClock(len(raw))

@@ -4,20 +4,14 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations, product
+from itertools import combinations
 from pathlib import Path
 from unicodedata import combining, normalize
 
 import numpy as np
 
 from bampipe.data import readers
-from bampipe.data.guesses import (
-    describe,
-    find_roles,
-    is_time,
-    quantities_in_turn,
-    take_turns,
-)
+from bampipe.data.guesses import describe, find_roles, is_time, take_turns
 from bampipe.data.parts import axes_of, join_parts
 from bampipe.data.readers import columns_of, extension_of, is_log, is_text, lerobot, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
@@ -238,7 +232,7 @@ class _Logs:
     """The files of a folder while it is found out which are logs, and which belong together.
 
     ``found``: columns and their units, by file; ``passed``, ``remarks``: see `Survey`; ``beside``:
-    units of quantities that are no columns; ``flat``: whether one had several in one column.
+    units of quantities that are no columns.
     """
 
     folder: Path
@@ -249,7 +243,6 @@ class _Logs:
     remarks: list[str] = field(default_factory=list)
     beside: dict[str, str] = field(default_factory=dict)
     scanned: int = 0
-    flat: bool = False
 
     def paths(self) -> list[Path]:
         """The files that may be logs; others that hold data are left out by name."""
@@ -293,9 +286,7 @@ class _Logs:
                     raise InputError(f"no table: no column of numbers in it{_like(path)}")
                 small = path.stat().st_size < _SMALL and is_text(name)
                 wide, first = len(columns) > _MOST_COLUMNS, next(iter(columns))
-                looked_at = small or wide or len(columns) == 1
-                raw = self._read_one(name, columns, first) if looked_at else None
-                rows = 2 if raw is None else len(raw)
+                rows = len(self._read_one(name, columns, first)) if small or wide else 2
                 if wide and 0 < 10 * rows < len(columns):
                     raise InputError(
                         f"{rows} rows of {len(columns)} columns are no log",
@@ -303,14 +294,6 @@ class _Logs:
                     )
                 if small and rows < 2:
                     raise InputError("one row of numbers is no log")
-                turns = quantities_in_turn(raw.columns[first]) if raw and len(columns) == 1 else 1
-                if turns > 1:
-                    self.flat = True
-                    raise InputError(
-                        f"{turns} quantities take turns in its one column",
-                        remedy="write a column each, as numpy.savetxt(FILE,"
-                        f" numpy.loadtxt(FILE).reshape(-1, {turns})) does",
-                    )
                 self.found[name] = columns
             except InputError as error:
                 self.passed.append((name, str(error)))
@@ -350,8 +333,6 @@ class _Logs:
         stated = self.found[names[0]]
         several = [_role(column, stated[column]) for column in common].count("position") > 1
         axes = {} if several else axes_of(names)  # of which each has all joints are trials
-        if not whole and self.flat:
-            raise self.fault()
         if not whole or axes:
             pool = {n: self.found[n] for n in names} if axes and whole else self.found
             trials, reasons = join_parts(self.folder, pool, _role, self.dialect)
@@ -486,15 +467,14 @@ class _Logs:
                 role = "time" if is_time(raw.columns[column][sound]) else role
             unit = _unit(column, said, role)
             found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
-        keys = [c for c in found if c.is_integer and c.role != "time" and not c.is_constant]
-        for column, key in product((c for c in found if c.role == "position"), keys):
-            if column is not key and take_turns(column.values, key.values):
-                raise InputError(
-                    f"{column.name} is of another axis in each row, by {key.name}",
-                    where=trial.file,
-                    remedy="write a file for each, as for n, rows in"
-                    f" frame.groupby('{key.name}'): rows.to_csv(f'axis{{n}}.csv', index=False)",
-                )
+        keys = [c.values for c in found if c.is_integer and c.role not in ("time", "position")]
+        for moved in (c for c in found if c.role == "position" and take_turns(c.values, keys)):
+            raise InputError(
+                f"{moved.name} is of another axis in each row",
+                where=trial.file,
+                remedy="write a file for each axis, such as frame[k::n] or frame.groupby(ID) of"
+                " pandas, or a column for each",
+            )
         return tuple(found)
 
     def recordings(self, trial: TrialEntry) -> list[TrialEntry]:

@@ -118,13 +118,7 @@ def interpolate_spikes(table: TrialTable) -> None:
     wild_of = {column: find_spikes(values, POSITION) for column, values in positions.items()}
     sound = [np.where(wild_of[column], np.nan, values) for column, values in positions.items()]
     wild_of |= {c: find_wild_inputs(table.columns[c], sound) for c in table.inputs}
-    most = table.limits.nan_share
-    few = {c: w for c, w in wild_of.items() if 0 < w.sum() <= most * len(w)}
-    table.notes += [
-        f"column '{c}': {w.sum()} readings are far off, more than {most:.0%}: left in"
-        for c, w in wild_of.items()
-        if w.any() and c not in few
-    ]
+    few = {c: w for c, w in wild_of.items() if 0 < w.sum() <= table.limits.nan_share * len(w)}
     for column, wild in few.items():
         take_out(table, column, wild)
     if few:

@@ -56,9 +56,6 @@ _FOREIGN = (
     ),
 )
 """Lines of texts that are no table of samples, what they are, and what to do."""
-_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
-_MOST_GARBAGE = 1e-3
-"""Share of characters that no text has, which a serial line leaves where it is opened."""
 _TYPESET = {"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2009": " "}
 """Minus and blanks of typesetters."""
 _MOST = 0.8
@@ -105,10 +102,6 @@ def find_form(head: str) -> Form | None:
             filter(None, ("typeset minus signs and blanks are plain ones", inner.said))
         )
         return Form(said, lambda line: inner.rewrite(line.translate(plain)), inner.names)
-    if 0 < len(_CONTROL.findall(head)) < _MOST_GARBAGE * len(head):
-        clean = find_form(_CONTROL.sub("", head)) or Form("", str)
-        said = "; ".join(filter(None, ("control characters left out", clean.said)))
-        return Form(said, lambda line: clean.rewrite(_CONTROL.sub("", line)), clean.names)
     if found := _of_program(head, whole):
         return found
     ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
