@@ -425,7 +425,6 @@ def test_axes_in_turn_copies_and_whole_seconds(tmp_path):
     both = [np.column_stack([x, x + 2.0]).ravel() for x in (q, u)]
     write(tmp_path / "a/a.csv", "t,id,q_rad,tau_Nm", np.repeat(t, 2), np.tile([1, 2], 900), *both)
     for name, values in zip(("position", "torque", "time"), (*both, t), strict=True):
-        write(tmp_path / f"b/{name}.txt", "", values)
         write(tmp_path / f"c/{name}.txt", "", np.sort(values) if name != "time" else values)
     write(tmp_path / "e/e.csv", "t_s,q_rad,tau_Nm,volt", t, q, u, np.round(40 * q + 1, 3))
     for name, said in (("a", "of another axis in each row"), ("c", "2 rows for each time in time")):

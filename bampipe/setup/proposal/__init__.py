@@ -32,7 +32,7 @@ from bampipe.setup.proposal.device import (
 )
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
-from bampipe.setup.proposal.positions import fresh_readings, signed_readings, without_copies
+from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
 from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
 
@@ -90,7 +90,7 @@ def propose(
     if not device and not found.of(*DRIVERS):
         _refuse_goals(folder, found)
     notes = Notes(check=list(found.remarks))
-    found, registers = signed_readings(fresh_readings(without_copies(found, notes), notes))
+    found, registers = signed_readings(fresh_readings(found, notes), notes)
     chosen = find_device(folder, found, device)
     clock = clock_of(found, notes)
     match = Matcher(found, clock.t, set(clock.columns), registers)
