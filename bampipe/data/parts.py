@@ -143,6 +143,7 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
     counts = sorted((first.samples, second.samples))
     rows = counts[1] - counts[0] <= max(1, MOST_APART * counts[1])
     join: Literal["rows", "time", "start", ""] = "rows" if rows else ""
+    why = "no clock in common"
     if first.t is not None and second.t is not None:
         length, step = min(len(first.t), len(second.t)), float(np.median(np.diff(first.t)))
         apart = float(np.max(np.abs(first.t[:length] - second.t[:length])))
@@ -153,11 +154,11 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
         if not same:
             alike = _alike(*spans)
             join = "time" if overlap >= _OVERLAP * spans[0] else "start" if alike else ""
-            join = join if counts[1] < _TOO_FEW * counts[0] else ""
+            if _TOO_FEW * counts[0] < counts[1]:
+                join, why = "", "these are too few"
     if not join:
         raise InputError(
-            f"{second.samples} samples, where {main} has {first.samples}: too few, or no clock in"
-            " common",
+            f"{second.samples} samples, where {main} has {first.samples}, and {why}",
             where=other,
             remedy="are they one recording? export them at one rate, or each with its time",
         )

@@ -635,8 +635,9 @@ def _role(name: str, stated: str) -> str:
         return next(
             (_role_by_unit(x) for x in re.split(r"[_\W]+", name)[1:] if x in "AV" and x), ""
         )
-    named = next(iter(roles), "")
-    return named or lerobot.role_of(name) or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
+    if not roles and name.startswith(lerobot.STATE):
+        return "voltage" if "load" in name else "position"
+    return next(iter(roles), "") or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
 
 
 def _role_by_unit(text: str) -> str:

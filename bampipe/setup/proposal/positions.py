@@ -104,7 +104,7 @@ def signed_readings(found: Survey, notes: Notes) -> tuple[Survey, dict[str, Regi
     columns, positions = [], found.of("position")
     for c in found.columns:
         alike = (p.name for p in positions if guesses.is_copy(c.values, p.values))
-        copied = next(alike, "") if c.role in DRIVERS else ""
+        copied = next(alike, "") if c.role in DRIVERS and not c.is_constant else ""
         if copied:
             notes.check.append(f"{c.name} repeats {copied} in another unit, and drives nothing")
         values = registers[c.name].signed(c.values) if c.name in registers else c.values
