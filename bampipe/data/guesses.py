@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +39,7 @@ empty range below the bit shows it."""
 
 _NICE = (1, 1.2, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7.5, 8)
 _DERIVATIVE = 0.98
-"""Correlation of a column with the integral of another, both without a line, to be that of it."""
+"""Correlation of a column with the integral of another, both without drift, to be that of it."""
 DRIVEN, _CLEAR = 0.5, 0.95
 """Share of a column that the motion must explain for it to pass as what drives it."""
 MOVED, CLEARLY = 0.8, 0.5
@@ -47,6 +47,12 @@ MOVED, CLEARLY = 0.8, 0.5
 may leave than the other way round."""
 _STEADY = 50.0
 """Of the median step: the longest one of a time."""
+_COPIED = 1e-3
+"""Share of a column that a copy of it in another unit leaves: what rounding does."""
+_MOST_IN_TURN, _GOES_ON, _LEAPS = 64, 0.2, 0.4
+"""Quantities that take turns in one column, the most; change from one reading of a quantity to its
+next, over that from row to row, the most; the latter, squared, over twice the variance, the least.
+"""
 
 
 def time_unit(t: np.ndarray, said: str) -> str:
@@ -104,6 +110,29 @@ def follows(first: np.ndarray, second: np.ndarray) -> bool:
     """Whether ``second`` does what ``first`` did a little earlier, as a machine its reference."""
     slope = 0.5 * (np.gradient(first) + np.gradient(second))
     return float((first - second) @ slope) > 0.0
+
+
+def is_copy(values: np.ndarray, of: np.ndarray) -> bool:
+    """Whether readings (T,), wild ones apart, are those ``of`` another column in another unit."""
+    low, high = np.nanquantile(values, (0.01, 0.99))
+    usual = (low <= values) & (values <= high) & np.isfinite(of)
+    x, y = values[usual], of[usual]
+    if len(x) < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+        return False
+    return bool(1.0 - float(np.corrcoef(x, y)[0, 1]) ** 2 < _COPIED**2)
+
+
+def take_turns(values: np.ndarray, keys: Sequence[np.ndarray]) -> bool:
+    """Whether several quantities stand in one column (T,) in turn.
+
+    Readings leap from row to row, but not between rows with one of a key (T,), or every so many.
+    """
+    leaps = float(np.mean(np.diff(values) ** 2)) if len(values) > 10 * _MOST_IN_TURN else 0.0
+    if not leaps > 2.0 * _LEAPS * float(np.var(values)):
+        return False
+    rows, turns = np.arange(len(values)), range(2, _MOST_IN_TURN + 1)
+    orders = (np.argsort(key, kind="stable") for key in (*keys, *(rows % n for n in turns)))
+    return any(np.mean(np.diff(values[each]) ** 2) < _GOES_ON**2 * leaps for each in orders)
 
 
 @dataclass(frozen=True)
@@ -328,13 +357,16 @@ def _derivatives(matrix: Array, t: Array) -> dict[int, int]:
     """
     since = t - t[0]
     integrals = cumulative_trapezoid(matrix, since, axis=0, initial=0.0)
-    base, _ = np.linalg.qr(np.column_stack([np.ones_like(since), since]))
+    # Nor a parabola: what warms up would be the integral of whatever drifts.
+    base, _ = np.linalg.qr(np.column_stack([np.ones_like(since), since, since**2]))
     p, i = (each - base @ (base.T @ each) for each in (matrix, integrals))
     size = np.outer(np.linalg.norm(p, axis=0), np.linalg.norm(i, axis=0))
     alike = np.divide(p.T @ i, size, out=np.zeros_like(size), where=size > 0.0)
     np.fill_diagonal(alike, 0.0)
     found: dict[int, int] = {}
-    for k, rate in zip(*np.unravel_index(np.argsort(-alike, axis=None), alike.shape), strict=True):
+    # Of columns that repeat each other the first, whatever the rounding.
+    order = np.argsort(-np.round(alike, 9), axis=None, kind="stable")
+    for k, rate in zip(*np.unravel_index(order, alike.shape), strict=True):
         if alike[k, rate] < _DERIVATIVE:
             break
         if int(k) not in found and int(rate) not in found.values():

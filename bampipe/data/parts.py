@@ -4,7 +4,6 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Literal, cast
 
@@ -27,6 +26,8 @@ _SAME_STAMP = 0.6
 """Of a step: how far stamps of two clocks of the same samples may be apart."""
 _OVERLAP = 0.5
 """Share of the shorter part that both must have in common on one clock."""
+_TOO_FEW = 100
+"""Samples of one part for one of another, beyond which nothing between those is known."""
 _SAME_LENGTH = 0.2
 """Share by which lengths may differ of parts whose clocks are taken to start together."""
 
@@ -80,11 +81,6 @@ def join_parts(
         words = (w for w in _words(name) if w not in said[name] and w not in own[kind])
         groups[tuple(words)].append(name)
     trials, reasons = [], []
-
-    @cache
-    def clock(name: str) -> FileClock:
-        return _read_clock(folder, name, found[name], role, dialect)
-
     for names in groups.values():
         if len({kinds[name] for name in names}) != len(names) or len(names) < 2:
             continue
@@ -95,15 +91,25 @@ def join_parts(
         roles = {n: {role(f"{called[n]}:{c}", u) for c, u in found[n].items()} for n in names}
         main = max(names, key=lambda n: ("position" in roles[n], -names.index(n)))
         parts, alike = [], set()
+        own_clock = _read_clock(folder, main, found[main], role, dialect)
         for other in names:
             if other == main:
                 continue
+            clock = _read_clock(folder, other, found[other], role, dialect, own_clock)
             try:
-                parts.append(_part(main, other, called[other], clock(main), clock(other)))
+                parts.append(_part(main, other, called[other], own_clock, clock))
             except InputError as error:
+                turns, rest = divmod(own_clock.samples, clock.samples)
+                if roles[other] == {"time"} and turns > 1 and rest == 0:
+                    raise InputError(
+                        f"{turns} rows for each time in {other}: {turns} axes in one column?",
+                        where=main,
+                        remedy=f"write a column for each: .reshape(-1, {turns}) where they take"
+                        f" turns, .reshape({turns}, -1).T where one is below the other",
+                    ) from error
                 reasons.append(str(error))
                 continue
-            alike |= set(found[other]) & set(found[main]) - {clock(main).column}
+            alike |= set(found[other]) & set(found[main]) - {own_clock.column}
         if parts:
             named = called[main] if alike else ""
             trials.append(TrialEntry(file=main, kind="free", part=named, parts=tuple(parts)))
@@ -137,6 +143,7 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
     counts = sorted((first.samples, second.samples))
     rows = counts[1] - counts[0] <= max(1, MOST_APART * counts[1])
     join: Literal["rows", "time", "start", ""] = "rows" if rows else ""
+    why = "no clock in common"
     if first.t is not None and second.t is not None:
         length, step = min(len(first.t), len(second.t)), float(np.median(np.diff(first.t)))
         apart = float(np.max(np.abs(first.t[:length] - second.t[:length])))
@@ -145,11 +152,13 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
         overlap = min(ends) - max(first.start, second.start)
         spans = sorted((float(first.t[-1]), float(second.t[-1])))
         if not same:
-            alike = spans[0] >= (1.0 - _SAME_LENGTH) * spans[1]
+            alike = _alike(*spans)
             join = "time" if overlap >= _OVERLAP * spans[0] else "start" if alike else ""
+            if _TOO_FEW * counts[0] < counts[1]:
+                join, why = "", "these are too few"
     if not join:
         raise InputError(
-            f"{second.samples} samples, where {main} has {first.samples}, and no clock in common",
+            f"{second.samples} samples, where {main} has {first.samples}, and {why}",
             where=other,
             remedy="are they one recording? export them at one rate, or each with its time",
         )
@@ -163,9 +172,19 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
     )
 
 
+def _alike(*lengths: float) -> bool:
+    return min(lengths) >= (1.0 - _SAME_LENGTH) * max(lengths)
+
+
 def _read_clock(
-    folder: Path, name: str, columns: Columns, role: Callable[[str, str], str], dialect: Dialect
+    folder: Path,
+    name: str,
+    columns: Columns,
+    role: Callable[[str, str], str],
+    dialect: Dialect,
+    beside: FileClock | None = None,
 ) -> FileClock:
+    """The clock of a file, in the unit in which it lasts as long as one ``beside`` if unstated."""
     times = [column for column, unit in columns.items() if role(column, unit) == "time"]
     datetimes = {column: "" for column in times if columns[column] == "datetime"}
     wanted = times or list(columns)[:1]
@@ -176,7 +195,10 @@ def _read_clock(
         stamps = raw.columns[column]
         known = stamps[np.isfinite(stamps)]
         if len(known) > 1 and float(np.mean(np.diff(known) > 0)) > 0.9 and len(known) == len(raw):
-            unit = guesses.time_unit(stamps, columns[column])
+            unit, length = guesses.time_unit(stamps, columns[column]), float(known[-1] - known[0])
+            if beside is not None and beside.t is not None and not columns[column]:
+                sizes = {u: SECONDS[u] * length for u in (unit, *SECONDS) if u in SECONDS}
+                unit = next((u for u, x in sizes.items() if _alike(x, beside.t[-1])), unit)
             tick = SECONDS.get(unit, 1.0)
             start = raw.since.get(column, 0) / NANOSECONDS or float(known[0]) * tick
             return FileClock(len(raw), column, unit, (stamps - known[0]) * tick, start)

@@ -11,7 +11,7 @@ from unicodedata import combining, normalize
 import numpy as np
 
 from bampipe.data import readers
-from bampipe.data.guesses import describe, find_roles, is_time
+from bampipe.data.guesses import describe, find_roles, is_time, take_turns
 from bampipe.data.parts import axes_of, join_parts
 from bampipe.data.readers import columns_of, extension_of, is_log, is_text, lerobot, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
@@ -467,6 +467,14 @@ class _Logs:
                 role = "time" if is_time(raw.columns[column][sound]) else role
             unit = _unit(column, said, role)
             found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
+        keys = [c.values for c in found if c.is_integer and c.role not in ("time", "position")]
+        for moved in (c for c in found if c.role == "position" and take_turns(c.values, keys)):
+            raise InputError(
+                f"{moved.name} is of another axis in each row",
+                where=trial.file,
+                remedy="write a file for each axis, such as frame[k::n] or frame.groupby(ID) of"
+                " pandas, or a column for each",
+            )
         return tuple(found)
 
     def recordings(self, trial: TrialEntry) -> list[TrialEntry]:
@@ -627,8 +635,9 @@ def _role(name: str, stated: str) -> str:
         return next(
             (_role_by_unit(x) for x in re.split(r"[_\W]+", name)[1:] if x in "AV" and x), ""
         )
-    named = next(iter(roles), "")
-    return named or lerobot.role_of(name) or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
+    if not roles and name.startswith(lerobot.STATE):
+        return "voltage" if "load" in name else "position"
+    return next(iter(roles), "") or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
 
 
 def _role_by_unit(text: str) -> str:

@@ -59,6 +59,8 @@ _CELSIUS = frozenset(["degc", "°c", "c", "celsius"])
 _NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
 _BESIDE = re.compile(r"(?i)(?:\A|(?<=[./]))units?[./]|(?:\A|[ _./])units?\Z")
 """Affix that marks a metadata field as the unit of a quantity: the rest names the quantity."""
+_INDEX = re.compile(r"\d+|0x[0-9A-Fa-f]+|\d[0-9A-Fa-f]{3}h")
+"""Number of an element, or of an object of CANopen."""
 _TOKEN = re.compile(
     r"(?P<number>(?<![^\W_])\d+(?:\.\d+)?(?:[eE]-?\d+)?|\.\d+)"
     r"|(?P<over>\s*(?:/|\bper\b)\s*)"
@@ -96,7 +98,7 @@ def units_in(names: Iterable[str]) -> dict[str, str]:
 
     def is_index(match: re.Match[str]) -> bool:
         alone = match["unit"] == "1" and others and numbered[match["name"]] == 1
-        return match["unit"].isdigit() and not alone
+        return bool(_INDEX.fullmatch(match["unit"])) and not alone
 
     return {n: m["unit"] for n, m in matches.items() if m["name"] and not is_index(m)}
 

@@ -21,6 +21,7 @@ class EncoderChannel(Record):
     zero: float = Field(default=0.0, description="Raw reading at position 0, by session.toml")
     counts_per_unit: float | None = Field(default=None, description="As in session.toml, or null")
     raw_unit: str = Field(default="", description="Unit that session.toml gives the column")
+    unit_in_log: bool = Field(default=False, description="Whether the log gives that unit, too")
     scale_sd: Size = Field(default=0.0, description="Standard uncertainty of scale, as a share")
 
 

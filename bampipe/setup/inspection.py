@@ -16,7 +16,7 @@ from bampipe.results.setup import AxisSetup, AxisState, PossibleMistake, SetupMi
 from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility, distance_from_prior
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
-from bampipe.setup.search import EXPLAINED, Finding, Search, shorten, spoilt_axes, spread_trials
+from bampipe.setup.search import EXPLAINED, MOST_TRIALS, Finding, Search, shorten, spoilt_axes
 from bampipe.setup.turned_trials import TurnedTrial, find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -47,7 +47,8 @@ def inspect_setup(
     signals = Signals.of_session(system, session)
     _require_scale(system, motions[:1])
     of_kind = [[k for k, fits in enumerate(folds.fitted) if fits == kind] for kind in (True, False)]
-    chosen = [some[k] for some in of_kind for k in spread_trials(len(some))]
+    spread = (np.linspace(0, len(k) - 1, min(len(k), MOST_TRIALS)).round() for k in of_kind)
+    chosen = [k[n] for k, places in zip(of_kind, spread, strict=True) for n in map(int, places)]
     part = folds.subset(chosen)
     placeholders = _find_placeholders(system, session)
     ones = tuple(n for names in placeholders.values() for n in names)
@@ -120,12 +121,13 @@ def inspect_setup(
 
 
 def _describe_travel(system: System, session: IngestResult, motions: Sequence[Motion]) -> list[str]:
-    """Report axes that move implausibly far, as if degrees were taken for radians."""
+    """Report axes that move implausibly far, as if degrees were taken for radians unstated."""
     travel = np.max([np.ptp(motion.q, axis=0) for motion in motions], axis=0)
     found = []
     for coordinate, size in zip(system.model.device.coordinates, travel, strict=True):
         most, meant = _FARTHEST[coordinate.kind]
-        if size > most and session.axes[coordinate.name].raw_unit == coordinate.unit:
+        axis = session.axes[coordinate.name]
+        if size > most and axis.raw_unit == coordinate.unit and not axis.unit_in_log:
             found.append(
                 f"{coordinate.name} moves through {size:.3g} {coordinate.unit}: is its position in"
                 f" {meant}?"

@@ -378,12 +378,6 @@ def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
     return [m.rows(slice(at, at + each)) for m, at in zip(motions, starts, strict=True)]
 
 
-def spread_trials(count: int) -> list[int]:
-    """Return numbers of at most `MOST_TRIALS` of ``count`` trials, evenly spread."""
-    chosen = np.linspace(0, max(count - 1, 0), min(count, MOST_TRIALS))
-    return [int(number) for number in np.unique(chosen.round())]
-
-
 def scale_by_power_of_ten(signals: Signals, names: tuple[str, ...], power: float) -> Correction:
     return hypotheses.scale_correction(signals, names, 10.0**power, 3.0)
 

@@ -73,7 +73,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         rows = _ingest_trials(session, config, every, channels, samples, progress)
     text = ("trial_id", "file", "kind", "locked_axis", "status", "reason", "repairs")
     trials = (
-        pd.DataFrame(rows).drop(columns=["dead", "spans"]).astype(dict.fromkeys(text, "string"))
+        pd.DataFrame(rows)
+        .drop(columns=["dead", "spans", "stated"])
+        .astype(dict.fromkeys(text, "string"))
     )
     write_parquet(out / "ingest/trials.parquet", trials)
     # The announced rate, or the median of the trials if the time stamps disagree.
@@ -189,6 +191,7 @@ def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, 
         "reason": reason,
         "repairs": "" if trial is None else "; ".join([*trial.repairs, *trial.notes]),
         "dead": () if trial is None else tuple(trial.dead),
+        "stated": () if trial is None else trial.stated,
         "spans": {
             name.removeprefix("q_"): float(np.ptp(values))
             for name, values in (trial.columns.items() if trial and entry.kind in MOVING else ())
@@ -227,6 +230,7 @@ def _description(
                 resolution_stated=encoders[encoder.name].stated,
                 resolution_measured=encoders[encoder.name].measured,
                 raw_unit=encoder.stated_unit,
+                unit_in_log=any(encoder.column in row["stated"] for row in rows),
             )
             for encoder in session.encoders
         },

@@ -56,6 +56,15 @@ def test_friction_that_turns_with_an_axis_for_two_samples_is_not_wild() -> None:
     assert np.flatnonzero(find_wild_inputs(pulse, [turned])).tolist() == [at, at + 1]
 
 
+def test_what_a_drive_does_is_not_wild() -> None:
+    """Neither kicks that answer leaps of an axis nor a train of pulses, in numbers of up to 1 %."""
+    leaps = COUNTS + 80.0 * np.searchsorted((700, 1900, 2500, 3600), np.arange(T.size))
+    kicked = FORCE - 12.0 * np.isin(np.arange(T.size), (701, 1901, 2501, 3601))
+    assert [find_wild_inputs(kicked, [q]).sum() for q in (COUNTS, leaps)] == [4, 0]
+    pulses = 0.02 * RNG.standard_normal(T.size) + 5.0 * (np.arange(T.size) % 250 == 100)
+    assert not find_wild_inputs(pulses, [COUNTS]).any()
+
+
 def test_a_dead_second_is_found_and_a_controllers_kick_is_not_wild() -> None:
     """It leaves the drive unsteady, as no wild reading does."""
     kicked = FORCE.copy()

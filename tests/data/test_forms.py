@@ -116,10 +116,20 @@ def test_texts_that_are_no_plain_tables(tmp_path: Path, name: str):
 
 def test_units_of_properties_are_heard(tmp_path: Path):
     path = tmp_path / "a.csv"
-    path.write_text(FORMS["properties of channels"][0])
-    assert columns_of(path) == {"Time (1)": "", "q": "deg", "Time (2)": "", "u": "Nm"}
-    path.write_text(FORMS["properties with colons"][0])
-    assert columns_of(path) == {"t": "s", "q": "rad", "u": "N*m"}
+    rate = lines(";{t:.3f};{q:.4f};{u:.4f}", "Name:;t;q;u\nUnit:;s;°;Nm\nRate:;9 Hz;9 Hz;9 Hz\n")
+    below = lines("{n:4d}  {u:8.3f}  {q:8.4f}", "mSec    TORQUE  A (B)\n        FT-LBS  DEG\n")
+    for text, units in (
+        (
+            FORMS["properties of channels"][0],
+            {"Time (1)": "", "q": "deg", "Time (2)": "", "u": "Nm"},
+        ),
+        (FORMS["properties with colons"][0], {"t": "s", "q": "rad", "u": "N*m"}),
+        (rate, {"t": "s", "q": "°", "u": "Nm"}),
+        (below, {"mSec": "", "TORQUE": "FT-LBS", "A (B)": "DEG"}),
+        (lines("{t:.3f},{q:.4f}", "t [s],q (6064h)\n"), {"t [s]": "s", "q (6064h)": ""}),
+    ):
+        path.write_text(text)
+        assert columns_of(path) == units
 
 
 def test_words_for_no_reading_are_no_numbers_and_pages_begin_no_recording(tmp_path: Path):
@@ -392,6 +402,26 @@ def test_a_second_table_in_a_file_and_a_segment_of_labview(tmp_path):
     (tmp_path / "a.lvm").write_text(text)
     raw = read_trial(tmp_path / "a.lvm", ["Angle [Degrees]"], name="a.lvm")
     assert len(raw) == 120 and raw.begun == (60,)
+    blocks = [lines("{t:.3f}\t{q:.4f}", f"Block\t\tAt\t{k}\ts\nt\tq\nSec\tmm\n") for k in "12"]
+    (tmp_path / "a.dat").write_text("\n".join(blocks))
+    assert read_trial(tmp_path / "a.dat", ["t", "q"]).begun == (60,)
+
+
+def test_axes_in_turn_copies_and_whole_seconds(tmp_path):
+    t = np.arange(900) / 100.0
+    q, u = np.sin(3 * t), np.sign(np.cos(3 * t)) + np.cos(3 * t)
+    both = [np.column_stack([x, x + 2.0]).ravel() for x in (q, u)]
+    write(tmp_path / "a/a.csv", "t,id,q_rad,tau_Nm", np.repeat(t, 2), np.tile([1, 2], 900), *both)
+    for name, values in {"position": both[0], "torque": both[1], "time": t}.items():
+        write(tmp_path / f"c/{name}.txt", "", np.sort(values))
+    write(tmp_path / "e/e.csv", "t_s,q_rad,tau_Nm,volt", t, q, u, np.round(40 * q + 1, 3))
+    for name, said in (("a", "of another axis in each row"), ("c", "2 rows for each time in time")):
+        with pytest.raises(InputError, match=said):
+            propose(tmp_path / name)
+    assert any(line.startswith("volt repeats q_rad") for line in propose(tmp_path / "e").check)
+    write(tmp_path / "d/angle.csv", "time,q_rad", 1e3 * t, q)
+    write(tmp_path / "d/torque.csv", "time,tau_Nm", np.arange(10.0), u[::90])
+    assert [p.time_unit for p in survey(tmp_path / "d").trials[0].parts] == ["s"]
 
 
 def test_codes_for_no_reading_are_taken_for_none_and_hours_pass(tmp_path):

@@ -108,21 +108,18 @@ def test_degrees_milliamperes_and_decimal_commas(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("stamps", "time"),
+    ("stamps", "unit"),
     [
-        (T, 'column = "t"\nunit = "s"'),
-        (1.79e9 + T, 'column = "t"\nunit = "s"'),
-        (np.rint(T * 1e9), 'column = "t"\nunit = "ns"'),
-        (1_790_000_000_000_000 + np.rint(T * 1e6), 'column = "t"\nunit = "us"'),
-        ([f"2026-10-03T10:12:{t:09.6f}" for t in T], 'column = "t"\nunit = "datetime"'),
-        (
-            [f"03.10.2026 10:12:{t:09.6f}" for t in T],
-            'column = "t"\nunit = "datetime"\nformat = "%d.%m.%Y %H:%M:%S.%f"',
-        ),
+        (T, "s"),
+        (1.79e9 + T, "s"),
+        (np.rint(T * 1e9), "ns"),
+        (1_790_000_000_000_000 + np.rint(T * 1e6), "us"),
+        ([f"2026-10-03T10:12:{t:09.6f}" for t in T], "datetime"),
+        ([f"03.10.2026 10:12:{t:09.6f}" for t in T], 'datetime"\nformat = "%d.%m.%Y %H:%M:%S.%f'),
     ],
 )
-def test_clocks(tmp_path, stamps, time):
-    text = log({"t": stamps, "q": Q, "i": I})
+def test_clocks(tmp_path, stamps, unit):
+    time, text = f'column = "t"\nunit = "{unit}"', log({"t": stamps, "q": Q, "i": I})
     samples, trial, _ = ingested(tmp_path, text, time=time, **PLAIN)
     check(samples)
     assert trial["status"] == "ok"

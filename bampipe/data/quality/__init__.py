@@ -55,4 +55,4 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
     encoders.refuse_wrong_motion(table, columns)
     encoders.refuse_wrong_brakes(table, columns)
     rate = clock.rate_of(table.t)
-    return CleanTrial(table.t, columns, rate, table.repairs, table.notes, table.dead)
+    return CleanTrial(table.t, columns, rate, table.repairs, table.notes, table.dead, {*raw.units})

@@ -17,6 +17,9 @@ input jumps with the friction of every reversal, and its median tells its noise.
 _CALM = 0.05
 """Share of that by which its neighbours may change their pace: a machine at a stop turns round, and
 the kick of a controller leaves its drive unsteady."""
+_LEAP, _OFTEN, _ALIKE = 6.0, 3, 0.1
+"""Of the median curvature, where there is any: that of a leap of an axis; such leaps, the least;
+share of their height by which pulses of one train differ."""
 _LONGEST_SPIKE = 2
 """Samples of one spike, the most."""
 _ROUNDING = 1e-6
@@ -82,27 +85,39 @@ def find_spikes(values: np.ndarray, rule: tuple[float, float]) -> np.ndarray:
 def find_wild_inputs(values: Array, positions: Sequence[Array]) -> Flags:
     """Tell which finite readings (T,) of an input are wild, (T,).
 
-    Not those of a usual size during which an axis turns back and forth: friction turns with it.
-    ``positions``: of each axis, (T,).
+    Not those of a usual size during which an axis turns back and forth: friction turns with it. Nor
+    any if most come where an axis leaps, as a controller answers it, or as a train of equal pulses.
+
+    ``positions``: of each axis, (T,), NaN where they are wild themselves.
     """
     wild = find_spikes(values, INPUT)
     if not wild.any():
         return wild
     low, high = np.quantile(values[~wild], (0.01, 0.99))
     changes = [np.diff(q) for q in positions]
-    for start, stop in zip(*find_runs(wild), strict=True):
+    bends = [np.abs(np.diff(each)) for each in changes]
+    some = [np.append(x[x > _ROUNDING * np.nanmax(x)], np.inf) for x in bends]
+    leaps = [x > _LEAP * np.median(usual) for x, usual in zip(bends, some, strict=True)]
+    answers = 0
+    starts, stops = find_runs(wild)
+    for start, stop in zip(starts, stops, strict=True):
         usual = np.all((low < values[start:stop]) & (values[start:stop] < high))
         steps = [each[[start - 2, start - 1, stop - 2, stop]] for each in changes]
         turns = any(x[0] * (x[1] + x[2]) < 0.0 and x[3] * (x[1] + x[2]) < 0.0 for x in steps)
+        answers += any(each[start - 2 : stop + 1].any() for each in leaps)
         wild[start:stop] = not (usual and turns)
-    return wild
+    pulses = values[starts]
+    even = len(starts) > _OFTEN and np.ptp(np.diff(starts)) <= 1
+    train = even and np.ptp(pulses) < _ALIKE * np.abs(pulses).max()
+    return wild & (not train and answers < max(_OFTEN, 0.5 * len(starts)))
 
 
 def interpolate_spikes(table: TrialTable) -> None:
     """Take wild readings of positions and inputs out and interpolate them, where they are few."""
     positions = {e.column: table.columns[e.column] for e in table.session.encoders}
     wild_of = {column: find_spikes(values, POSITION) for column, values in positions.items()}
-    wild_of |= {c: find_wild_inputs(table.columns[c], [*positions.values()]) for c in table.inputs}
+    sound = [np.where(wild_of[column], np.nan, values) for column, values in positions.items()]
+    wild_of |= {c: find_wild_inputs(table.columns[c], sound) for c in table.inputs}
     few = {c: w for c, w in wild_of.items() if 0 < w.sum() <= table.limits.nan_share * len(w)}
     for column, wild in few.items():
         take_out(table, column, wild)

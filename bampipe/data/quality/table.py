@@ -69,6 +69,7 @@ class CleanTrial:
         repairs: what was changed or left out.
         notes: what was noticed and left as it is.
         dead: stretches over which a sensor was dead, that are left out of everything.
+        stated: columns of the file that it gives a unit.
     """
 
     t: np.ndarray
@@ -77,6 +78,7 @@ class CleanTrial:
     repairs: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     dead: list[DeadStretch] = field(default_factory=list)
+    stated: Collection[str] = ()
 
 
 class TrialTable:

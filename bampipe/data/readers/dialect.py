@@ -81,8 +81,11 @@ class TableLayout:
     def is_chatter(self, text: str) -> bool:
         """Whether a line among the samples is text without a number in any cell."""
         row = [cell for cell in self.cells(text) if cell not in NULLS]
-        plain = not any(_is_number(cell, self.decimal) or is_moment(cell) for cell in row)
-        wordy = plain and text.isprintable() and any(map(str.isalpha, text))
+        count = sum(_is_number(cell, self.decimal) or is_moment(cell) for cell in row)
+        # A title of what follows may hold the number of it.
+        titled = len(self.cells(text)) != len(self.header) and self.is_remark(text)
+        plain = 2 * count < len(row) if titled else not count
+        wordy = plain and text.expandtabs().isprintable() and any(map(str.isalpha, text))
         return wordy or _is_remark(text)
 
 
@@ -117,7 +120,10 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     delimiters: list[str] = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
     index, delimiter, header = _header(lines, columns, dialect, delimiters)
     body = lines[index + 1 :]
-    units = units_in(header) | _units_of_motion([line.text for line in lines[:index]], header)
+    named = lines[max(index, 0)].text
+    # Not the joint whose name was put in brackets.
+    units = {h: u for h, u in units_in(header).items() if dialect.names or u in named}
+    units |= _units_of_motion([line.text for line in lines[:index]], header)
     remarks = []
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
@@ -129,6 +135,8 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     for at, line in enumerate(body):
         remark = _is_remark(line.text)
         row = cells(_REMARK.sub("", line.text, count=1) if remark else line.text, delimiter)
+        if delimiter == " " and 1 < len(row) < len(header) and _are_units(row):
+            row = _below(line.text, header, named)
         row, property_row = _of_properties(row)
         property_row &= at < first < len(body)
         if (
@@ -137,7 +145,8 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
             and not (remark and not _are_units(row))
             and not (property_row and not all(unit(x) for x in row if x and not x[0].isdigit()))
         ):
-            units |= {h: bare(u) for h, u in zip(header, row, strict=False) if bare(u)}
+            said = {h: bare(u) for h, u in zip(header, row, strict=False) if bare(u)}
+            units = said | units if property_row else units | said
             remarks.append(f"row {line.number} gives units")
             passed += 1
             if not property_row:
@@ -516,6 +525,19 @@ def _is_unit_row(row: list[str], header: list[str], columns: Sequence[str]) -> b
         and not any(_POINT.match(cell) and cell != "1" for cell in said)
         and any(re.search(r"[A-Za-z%°Ωµμ]", cell) and len(bare(cell)) <= 10 for cell in said)
     )
+
+
+def _below(text: str, header: list[str], title: str) -> list[str]:
+    """The words of a line, each in the cell of the name above it; ``title``: the line of names."""
+    row, at, middles = [""] * len(header), 0, []
+    for name in header:
+        at = max(title.find(name, at), at)
+        middles.append(at + 0.5 * len(name))
+        at += len(name)
+    for word in re.finditer(r"\S+", text):
+        far = [abs(0.5 * (word.start() + word.end()) - middle) for middle in middles]
+        row[far.index(min(far))] = word[0]
+    return row
 
 
 def _are_units(row: list[str]) -> bool:

@@ -122,13 +122,6 @@ def vector_columns(path: Path, schema: pa.Schema) -> dict[str, tuple[str, int]]:
     return found
 
 
-def role_of(name: str) -> str:
-    """The role of a column whose name says no more than where it stands in a data set."""
-    if not name.startswith(STATE):
-        return ""
-    return "voltage" if "load" in name else "position"
-
-
 def describe_loops(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> str:
     """Say how late every joint of a data set follows its goal; "" where it has no joints.
 

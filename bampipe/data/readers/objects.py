@@ -30,11 +30,6 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
 READER = ArrayReader("value", _opened)
 
 
-def _texts(content: object) -> dict[str, str]:
-    """The texts in a parsed file, by their paths."""
-    return {path: text for path, text in leaves(content) if isinstance(text, str)}
-
-
 def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
     """Arrays (T,) or (T, k) of numbers, or (T,) of moments, in a parsed text, by their paths."""
     if isinstance(value, dict):
@@ -111,9 +106,10 @@ def _contents(path: Path, wanted: Sequence[str]) -> Opened:
         and not any(isinstance(x, list) and len(x) > len(v) for x in v[0].values())
         for v in lists.values()
     )
-    texts = _texts(content)
+    texts = {path: text for path, text in leaves(content) if isinstance(text, str)}
     units = units_beside(texts)
-    alone = {key: _column([value], "", units) for key, value in _numbers(content).items()}
+    beside = leaves(content) if isinstance(content, dict) else ()
+    alone = {k: _column([x], "", units) for k, x in beside if is_number(x) and "[" not in k}
     if not (lists and single) and (arrays := dict(_arrays(content))):
         kinds = {label: "M" * (array.dtype.kind == "O") for label, array in arrays.items()}
         called = called_signals(arrays, texts).items()
@@ -173,9 +169,3 @@ def _parsed(text: str, where: str = "") -> object:
         raise InputError(
             f"not sound JSON{line}", where=where, remedy="was the log cut off? copy it again"
         ) from error
-
-
-def _numbers(content: object) -> dict[str, object]:
-    """The numbers beside the samples of a parsed file."""
-    found = leaves(content) if isinstance(content, dict) else ()
-    return {key: value for key, value in found if is_number(value) and "[" not in key}

@@ -90,7 +90,7 @@ def propose(
     if not device and not found.of(*DRIVERS):
         _refuse_goals(folder, found)
     notes = Notes(check=list(found.remarks))
-    found, registers = signed_readings(fresh_readings(found, notes))
+    found, registers = signed_readings(fresh_readings(found, notes), notes)
     chosen = find_device(folder, found, device)
     clock = clock_of(found, notes)
     match = Matcher(found, clock.t, set(clock.columns), registers)

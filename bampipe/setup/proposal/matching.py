@@ -14,8 +14,6 @@ from bampipe.setup.proposal.positions import travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
 _NO_LESS = 0.03
-_SAME = 1.0 - 1e-9
-"""Correlation of one reading in two units."""
 _SUPPLIED = frozenset(["in", "input", "supply", "bus", "battery"])
 """Words in the name of what a converter takes up rather than what its motor gets."""
 _NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
@@ -85,7 +83,8 @@ class Matcher:
             return found[0] if found else None
         best = found[0]
         for other in found[1:]:
-            alike = 0.9 < abs(float(np.corrcoef(best.values, other.values)[0, 1])) < _SAME
+            alike = abs(float(np.corrcoef(best.values, other.values)[0, 1])) > 0.9
+            alike &= not guesses.is_copy(best.values, other.values)
             best = other if alike and guesses.follows(best.values, other.values) else best
         self.rivals = [c.name for c in found]
         drives = [c for c in self.found.of(*DRIVERS) if not c.is_constant]

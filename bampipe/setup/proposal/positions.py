@@ -89,11 +89,11 @@ def fresh_readings(found: Survey, notes: Notes) -> Survey:
     return replace(found, columns=columns)
 
 
-def signed_readings(found: Survey) -> tuple[Survey, dict[str, Register]]:
+def signed_readings(found: Survey, notes: Notes) -> tuple[Survey, dict[str, Register]]:
     """The log with its registers as signed numbers, and how each of them holds its sign.
 
     A position that counts on where a counter starts anew is no register: like ingest, it is
-    unwrapped, and wild readings are taken out.
+    unwrapped, and wild readings are taken out. No position in another unit passes for a drive.
     """
     registers = {
         column.name: register
@@ -101,8 +101,12 @@ def signed_readings(found: Survey) -> tuple[Survey, dict[str, Register]]:
         if (register := guesses.find_register(column.values)) is not None
         and (register.sign_bit or column.role != "position")
     }
-    columns = []
+    columns, positions = [], found.of("position")
     for c in found.columns:
+        alike = (p.name for p in positions if guesses.is_copy(c.values, p.values))
+        copied = next(alike, "") if c.role in DRIVERS and not c.is_constant else ""
+        if copied:
+            notes.check.append(f"{c.name} repeats {copied} in another unit, and drives nothing")
         values = registers[c.name].signed(c.values) if c.name in registers else c.values
         if c.role == "position" and c.name not in registers and c.si != "m":
             turn = 0.0 if in_counts(c) else 2.0 * np.pi / c.scale
@@ -113,5 +117,5 @@ def signed_readings(found: Survey) -> tuple[Survey, dict[str, Register]]:
             if 0 < np.sum(~known) <= _MOST_WILD * len(values):
                 rows = np.arange(len(values))
                 values = np.interp(rows, rows[known], values[known])
-        columns.append(replace(c, values=values))
+        columns.append(replace(c, values=values, role="reference" if copied else c.role))
     return replace(found, columns=tuple(columns)), registers
