@@ -48,9 +48,7 @@ def build_run_report(results: Results, progress: Callable[[float, str], None]) -
         progress(0.7 * number / len(SECTIONS), name)
         module = importlib.import_module(f"bampipe.report.sections.{name}")
         with style.use_style():
-            blocks = tuple(module.list_blocks(results))
-        if blocks:
-            sections.append(Section(module.TITLE, blocks))
+            sections.append(Section.gather(module.TITLE, module.list_blocks(results)))
     session, seconds = results.session, 0
     parts = ["simulated"] if session.simulated else []
     parts.append(f"device {session.device} {session.device_serial}".rstrip())
@@ -60,7 +58,8 @@ def build_run_report(results: Results, progress: Callable[[float, str], None]) -
         seconds = max(0, int((when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()))
     if session.operator:
         parts.append(f"by {session.operator}")
-    document = Document(f"Session {session.session_id}", ", ".join(parts), tuple(sections))
+    shown = tuple(section for section in sections if section.blocks)
+    document = Document(f"Session {session.session_id}", ", ".join(parts), shown)
     progress(0.7, "page for exploring")
     explorer = explorer_page(results, document.subtitle)
     progress(0.85, "typesetting")

@@ -8,15 +8,7 @@ import numpy as np
 from bampipe.lists import count_noun, join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.report import style
-from bampipe.report.document import (
-    Block,
-    Bullets,
-    Callout,
-    Figure,
-    Paragraph,
-    Subheading,
-    Table,
-)
+from bampipe.report.document import Block, Callout, Figure, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.sections import next_trial
 from bampipe.report.wording import format_decimals, format_digits, format_unit, split_name
@@ -44,7 +36,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
     every = (results.read(DiagnoseResult, model) for model in results.models)
     found = [content for content in every if content is not None]
     if not found:
-        yield Paragraph(f"No model has been diagnosed yet: run `{results.diagnose_command}`.")
+        yield f"No model has been diagnosed yet: run `{results.diagnose_command}`."
     for content in found:
         if len(found) > 1:
             yield Subheading(f"Model `{content.model}`")
@@ -55,10 +47,9 @@ def _show_model(
     results: Results, found: DiagnoseResult, later: Mapping[str, Maps]
 ) -> Iterator[Block]:
     model, axes = found.model, results.order_axes(found.axes)
-    yield Bullets(tuple(entry.sentence for entry in axes.values()))
+    yield tuple(entry.sentence for entry in axes.values())
     yield _tabulate_verdicts(found, axes)
-    if limits := phrases.limits(found):
-        yield Paragraph(limits)
+    yield phrases.limits(found)
     lacking = [axis for axis in axes if axis in found.lacking]
     if found.ranking and lacking:
         yield _tabulate_ranking(found.ranking)
@@ -69,30 +60,29 @@ def _show_model(
     for axis in lacking:
         if maps := found.maps.get(axis):
             yield _draw_maps(model, axis, axes[axis].unit, maps, later.get(axis, {}))
-    if windows := [window for window in found.worst_windows if window.axis in lacking]:
-        yield _tabulate_windows(windows)
+    yield _tabulate_windows([one for one in found.worst_windows if one.axis in lacking])
 
 
-def _tell_sensitivity(results: Results, model: str) -> Paragraph:
+def _tell_sensitivity(results: Results, model: str) -> str:
     """Name the effects that these trials would not have revealed, if nothing is missing."""
     proposed = results.read(NextResult, model)
     if proposed is not None and proposed.sensitivity:
-        return Paragraph(f"{proposed.why} The table under {next_trial.TITLE} lists every effect.")
+        return f"{proposed.why} The table under {next_trial.TITLE} lists every effect."
     option = f" --model {model}" if len(results.models) > 1 else ""
-    return Paragraph(
+    return (
         f"`bampipe next {results.root.name}{option}` computes the size up to which an effect would"
         " go unnoticed in these trials, and the trial that would reveal it."
     )
 
 
-def _advise(results: Results, found: DiagnoseResult) -> Paragraph:
+def _advise(results: Results, found: DiagnoseResult) -> str:
     """Return the next command, or its result if it has been run."""
     compared, wanted = results.read(CompareResult), {*found.selected}
     for rung in compared.ladder if compared else ():
         if wanted and rung.parent == found.model and wanted == {*(rung.added or "").split(", ")}:
-            return Paragraph(f"Added since, as model `{rung.model}`.")
+            return f"Added since, as model `{rung.model}`."
     if found.next.startswith("bampipe draft ") and results.read(DraftResult, found.model):
-        return Paragraph("Drafted since (under Drafts).")
+        return "Drafted since (under Drafts)."
     return results.state_next(found.next)
 
 
@@ -127,7 +117,7 @@ def _tabulate_sets(found: DiagnoseResult) -> Iterator[Block]:
         ]
         columns = "Effects | >Probability | >Log evidence over the first (nats)"
         yield Table("Sets of effects, the most probable first", columns, rows)
-    yield Paragraph(phrases.null_distribution(found.chance))
+    yield phrases.null_distribution(found.chance)
 
 
 def tabulate_candidates(

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from bampipe.lists import join_names
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Formulas, Paragraph, Subheading, Table
+from bampipe.report.document import Block, Figure, Formulas, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import split_name
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
@@ -32,7 +32,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
         diagnosis = results.read(DiagnoseResult, model)
         for axis, one in found.axes.items():
             yield Subheading(f"{axis.capitalize()}, model `{model}`")
-            yield Paragraph(one.sentence)
+            yield one.sentence
             effects = {name: found.effects[name] for name in one.effects}
             if effects:
                 yield Formulas(tuple(f"{n}: {e.expression}" for n, e in effects.items()))

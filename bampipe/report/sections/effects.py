@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from bampipe.lists import join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Formulas, Paragraph, Subheading, Table
+from bampipe.report.document import Block, Figure, Formulas, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.sections.diagnosis import tabulate_candidates
 from bampipe.report.wording import format_digits, format_unit, format_with_sd, split_name
@@ -34,7 +34,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
     friction = [term for term in terms.terms if term.name.startswith("friction:")]
     effects = [term for term in terms.terms if term not in friction]
     if not effects:
-        yield Paragraph(f"Model `{results.model}` is the device without effects.")
+        yield f"Model `{results.model}` is the device without effects."
     if curves := [term.curves[0] for term in friction if term.curves]:
         caption = (
             "Identified friction of each axis with its 95 % band, over the motion of the trials."
@@ -50,14 +50,12 @@ def _show_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator
     """Yield the blocks of one effect; ``shown``: versions whose worst window is already drawn."""
     text = term.text
     yield Subheading(f"`{term.name}`")
-    yield Paragraph(f"{text.summary}. {_list_estimates(results, term)}".rstrip())
+    yield f"{text.summary}. {_list_estimates(results, term)}".rstrip()
     yield Formulas(text.formulas)
     yield from _draw_effect(results, term, shown)
-    if text.on_the_machine:
-        yield Paragraph(f"**On the machine.** {text.on_the_machine}.")
-    yield Paragraph(f"**Diagnosis.** {_tell_alternatives(results, term.name)}")
-    if text.source:
-        yield Paragraph(f"**Source.** {text.source}.")
+    yield f"**On the machine.** {text.on_the_machine}." if text.on_the_machine else ""
+    yield f"**Diagnosis.** {_tell_alternatives(results, term.name)}"
+    yield f"**Source.** {text.source}." if text.source else ""
 
 
 def _list_estimates(results: Results, term: ModelTerm) -> str:
@@ -89,7 +87,7 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator
     name = f"effect-{term.name.replace(':', '-')}"
     curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_CURVE_SHARE]
     if term.curves and not curves:
-        yield Paragraph("No curve is drawn: no single variable accounts for a fifth of its force.")
+        yield "No curve is drawn: no single variable accounts for a fifth of its force."
     found = _find_window(results, term)
     if found is None or found.added in shown:
         yield from _draw_contribution(name, term, curves)

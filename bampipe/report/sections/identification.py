@@ -10,7 +10,7 @@ import pandas as pd
 from bampipe.lists import join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     find_digits,
@@ -34,28 +34,23 @@ _PANEL_COLUMNS, _MOST_PANEL_ROWS = (2, 3, 4), 7
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 
-def list_blocks(results: Results) -> Iterator[Block]:
+def list_blocks(results: Results) -> Iterator[Block | None]:
     """Yield the parameters, how they converged, and the motion."""
     identified = results.read(IdentifyResult)
     if identified is None:
         yield results.state_undone("No parameters have been identified", "identify")
         return
     yield _tabulate_parameters(results, identified)
-    if identified.base_parameters:
-        yield _tabulate_combinations(identified.base_parameters)
+    yield _tabulate_combinations(identified.base_parameters or ())
     known = identified.identifiability.sentences if identified.identifiability else ()
-    if notes := tuple(note for note in identified.notes if note not in known):
-        yield Bullets(notes)
-    if checks := _list_checks(identified):
-        yield Paragraph(checks)
-    if identified.state_3sigma:
-        yield _tabulate_states(results, identified.state_3sigma)
+    yield tuple(note for note in identified.notes if note not in known)
+    yield _list_checks(identified)
+    yield _tabulate_states(results, identified.state_3sigma or {})
     trace = results.table(results.model_file("trace.parquet"))
     # Least squares stores at most one row per trial: nothing converges along the data.
     if trace is not None and len(trace) > trace["trial_id"].nunique():
         yield _draw_convergence(results, identified, trace)
-    if motion := _draw_motion(results):
-        yield motion
+    yield _draw_motion(results)
 
 
 def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:

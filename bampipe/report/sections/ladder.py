@@ -6,7 +6,7 @@ import numpy as np
 
 from bampipe.lists import join_names
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Figure, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
@@ -35,10 +35,8 @@ def list_blocks(results: Results) -> Iterator[Block]:
     yield _tabulate_errors(results, rungs, axes)
     yield _draw(results, rungs, axes)
     yield from tabulate_runs(rungs, axes)
-    if compared.parameters:
-        yield _tabulate_parameters(results, rungs, compared.parameters)
-    if compared.moved:
-        yield Bullets(tuple(one.sentence for one in compared.moved))
+    yield _tabulate_parameters(results, rungs, compared.parameters)
+    yield tuple(one.sentence for one in compared.moved)
 
 
 def _tabulate_errors(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Table:

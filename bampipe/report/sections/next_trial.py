@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
-from bampipe.report.document import Block, Bullets, Callout, Paragraph, Table
+from bampipe.report.document import Block, Callout, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits
 from bampipe.results.diagnose import DiagnoseResult
@@ -19,21 +19,15 @@ def list_blocks(results: Results) -> Iterator[Block]:
     if found is None:
         return
     yield Callout("note", "The next trial", found.sentence)
-    yield Paragraph(f"{found.why} {found.expected}")
+    yield f"{found.why} {found.expected}"
     if identified := results.read(IdentifyResult):
         forecasts = read_forecasts(results.root, results.model)
         lines = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
-        if lines:
-            yield Bullets(tuple(one.replace("RUN", results.root.name) for one in lines))
-    best = found.proposals[0]
-    if best.confusion:
-        heads = ("with the present trials", "with the next one")
-        yield tabulate_confusion("Probability of confusing two effects", heads, best.confusion)
-    if best.sd:
-        title = "Standard deviation of each parameter, now and with the next trial"
-        yield tabulate_sds(title, best.sd)
-    if found.sensitivity:
-        yield _tabulate_sensitivity(found.sensitivity)
+        yield tuple(one.replace("RUN", results.root.name) for one in lines)
+    best, heads = found.proposals[0], ("with the present trials", "with the next one")
+    yield tabulate_confusion("Probability of confusing two effects", heads, best.confusion)
+    yield tabulate_sds("Standard deviation of each parameter, now and with the next trial", best.sd)
+    yield _tabulate_sensitivity(found.sensitivity)
 
 
 def tabulate_confusion(

@@ -7,7 +7,7 @@ the machine are in ``run.json``, and ``bampipe status`` prints them.
 from collections.abc import Iterator, Mapping
 from itertools import groupby
 
-from bampipe.report.document import Block, Paragraph, Subheading, Table
+from bampipe.report.document import Block, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.results.run import RunResult, StepRecord
 
@@ -19,10 +19,10 @@ def list_blocks(results: Results) -> Iterator[Block]:
     """Yield versions, files, stages and settings."""
     run = results.read(RunResult)
     if run is None:
-        yield Paragraph("This run folder has no run.json, so its provenance is not known.")
+        yield "This run folder has no run.json, so its provenance is not known."
         return
     stages = {name: made for name, made in run.stages.items() if name != "report"}
-    yield Paragraph(_list_versions(stages))
+    yield _list_versions(stages)
     if "ingest" in stages:
         read = stages["ingest"].inputs
         rows = [(name, digest[:_DIGITS]) for name, digest in read.items()]

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from bampipe.files import read_json_table
-from bampipe.report.document import Block, Bullets, Callout, Subheading, Table
+from bampipe.report.document import Block, Callout, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import NONE, format_digits, format_unit, format_with_sd
 
@@ -39,7 +39,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
         yield _tabulate_devices(results, paper["comparison"])
     if notes := tuple(paper.get("notes", {}).get("text", ())):
         yield Subheading("Where this differs from the paper, and why")
-        yield Bullets(notes)
+        yield notes
 
 
 def _tabulate_devices(results: Results, comparison: dict[str, Any]) -> Table:

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import choose_scale, format_scaled, format_with_sd, split_name
 from bampipe.results.stiffness import AxisStiffness, GearStiffness, StiffnessResult
@@ -24,17 +24,14 @@ def list_blocks(results: Results) -> Iterator[Block]:
         return
     axes, notes = found.axes, found.notes
     if not axes and not found.gears:
-        yield Paragraph(" ".join(notes) or "There are no locked trials.")
+        yield " ".join(notes) or "There are no locked trials."
         return
-    if axes:
-        yield _tabulate_axes(results, axes)
-    if found.gears:
-        yield _tabulate_gears(results, found.gears)
+    yield _tabulate_axes(results, axes)
+    yield _tabulate_gears(results, found.gears)
     loops = results.table("stiffness/loops.parquet")
     if loops is not None and len(loops):
         yield _draw_loops(results, axes, loops)
-    if notes:
-        yield Bullets(notes)
+    yield notes
 
 
 def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:

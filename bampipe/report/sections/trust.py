@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
-from bampipe.report.document import Block, Bullets, Paragraph, Table
+from bampipe.report.document import Block, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_decimals
 from bampipe.results.identify import IdentifiabilityReport, IdentifyResult, InnovationTests
@@ -16,9 +16,8 @@ def list_blocks(results: Results) -> Iterator[Block]:
     if identified is None:
         return
     if known := identified.identifiability:
-        yield Paragraph(_summarise(identified, known))
-        if known.sentences:
-            yield Bullets(known.sentences)
+        yield _summarise(identified, known)
+        yield known.sentences
         yield _tabulate_bounds(results, identified, known)
         if len(known.trials) > 1:
             rows = [(name, one.growth, one.parameter) for name, one in known.trials.items()]

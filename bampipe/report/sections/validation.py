@@ -8,7 +8,7 @@ import pandas as pd
 
 from bampipe.lists import join_names
 from bampipe.report import style, verdicts
-from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
@@ -33,19 +33,17 @@ def list_blocks(results: Results) -> Iterator[Block]:
         yield results.state_undone(said, "validate")
         return
     yield _tabulate_axes(results, validated)
-    if validated.trials:
-        yield _tabulate_trials(results, validated)
+    yield _tabulate_trials(results, validated)
     if validated.forces:
         shown = join_names(
             f"{split_name(name)} {format_digits(one.rmse)} {format_unit(one.unit)}"
             for name, one in validated.forces.items()
         )
         place = " at the handle" if results.pusher == "hand" else ""
-        yield Paragraph(f"Error of the predicted force{place} (RMSE): {shown}.")
+        yield f"Error of the predicted force{place} (RMSE): {shown}."
     if validated.free_run is not None and validated.free_run.drift:
         yield from _tabulate_drift(results, validated, validated.free_run.drift)
-    if validated.notes:
-        yield Bullets(validated.notes)
+    yield validated.notes
     residuals = _read_trial(results)
     if residuals is not None:
         yield _draw_forces(results, residuals)
@@ -94,7 +92,7 @@ def _tabulate_drift(
     horizons = sorted({h.horizon_s for one in axes.values() for h in one.horizons})
     reasons = {axis: one.reason for axis, one in axes.items() if one.reason}
     if not horizons and len(reasons) == len(axes) and len(set(reasons.values())) == 1:
-        yield Paragraph(f"No short free runs of this model. {next(iter(reasons.values()))}")
+        yield f"No short free runs of this model. {next(iter(reasons.values()))}"
         return
     if horizons:
         rows = []
@@ -118,9 +116,7 @@ def _tabulate_drift(
         )
         columns = " | ".join(("Axis", *heads, "Unit"))
         yield Table("Drift of the model in free runs", columns, rows, note)
-    if reasons:
-        lines = (f"{axis}: {why[:1].lower()}{why[1:]}" for axis, why in reasons.items())
-        yield Bullets(tuple(lines))
+    yield tuple(f"{axis}: {why[:1].lower()}{why[1:]}" for axis, why in reasons.items())
 
 
 def _read_trial(results: Results) -> pd.DataFrame | None:

@@ -7,7 +7,7 @@ import pandas as pd
 
 from bampipe.lists import join_names
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Paragraph, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.viscous import Damping, ViscousResult
@@ -22,7 +22,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
         yield results.state_undone("The viscous trials have not been used", "viscous")
     if found is None or not found.directions:
         return
-    yield Paragraph(_compare(found.directions))
+    yield _compare(found.directions)
     yield _tabulate(found.directions)
     trace = results.table(results.model_file("viscous.parquet"))
     if trace is not None and len(trace):
