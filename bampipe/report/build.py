@@ -6,7 +6,9 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 
+from bampipe.files import atomic_writer, write_text
 from bampipe.report import page, style, typeset
 from bampipe.report.document import Document, Figure, Section
 from bampipe.report.explorer.page import explorer_page
@@ -39,6 +41,16 @@ class Report:
         titles = tuple(section.title for section in document.sections)
         html = page.render_page(document, "explore.html" if explorer else "")
         return cls(typeset.render_pdf(document, recorded), html, explorer, figures, titles)
+
+    def write(self, folder: Path) -> None:
+        """Write the files below ``folder``, each whole or not at all."""
+        with atomic_writer(folder / "report.pdf", durable=False) as stream:
+            stream.write(self.pdf)
+        texts = {"report.html": self.html, "explore.html": self.explorer}
+        texts |= {f"figures/{name}.svg": svg for name, svg in self.figures.items()}
+        for name, text in texts.items():
+            if text:
+                write_text(folder / name, text, durable=False)
 
 
 def build_run_report(results: Results, progress: Callable[[float, str], None]) -> Report:
