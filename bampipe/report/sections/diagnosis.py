@@ -13,13 +13,7 @@ from bampipe.report.run_results import Results
 from bampipe.report.sections import next_trial
 from bampipe.report.wording import format_decimals, format_digits, format_unit, split_name
 from bampipe.results.compare import CompareResult
-from bampipe.results.diagnose import (
-    AxisVerdict,
-    DiagnoseResult,
-    RankedEffect,
-    ResidualMap,
-    WorstWindow,
-)
+from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, RankedEffect, ResidualMap
 from bampipe.results.draft import DraftResult
 from bampipe.results.next import NextResult
 
@@ -53,14 +47,35 @@ def _show_model(
     lacking = [axis for axis in axes if axis in found.lacking]
     if found.ranking and lacking:
         yield _tabulate_ranking(found.ranking)
-        yield from _tabulate_sets(found)
+        shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
+        if len(shown) > 1:
+            first = shown[0].log_evidence
+            sets = ((phrases.name_set(one, "`"), one) for one in shown[:_MOST_RANKED])
+            rows = [
+                (n, phrases.probability(s.probability), s.log_evidence - first) for n, s in sets
+            ]
+            columns = "Effects | >Probability | >Log evidence over the first (nats)"
+            yield Table("Sets of effects, the most probable first", columns, rows)
+        yield phrases.null_distribution(found.chance)
     yield _advise(results, found) if lacking else _tell_sensitivity(results, model)
     if found.suggested_trial is not None:
         yield Callout("note", "A trial that would tell more", found.suggested_trial.sentence)
     for axis in lacking:
         if maps := found.maps.get(axis):
             yield _draw_maps(model, axis, axes[axis].unit, maps, later.get(axis, {}))
-    yield _tabulate_windows([one for one in found.worst_windows if one.axis in lacking])
+    windows = [one for one in found.worst_windows if one.axis in lacking][:_MOST_WINDOWS]
+    yield Table(
+        "Worst windows: where the prediction fails most, and how the machine moved there",
+        "Axis | Trial | Time (s) | >RMSE | Motion ~1",
+        [
+            (
+                *(one.axis, one.trial_id),
+                f"{format_decimals(one.t_start, 1)} to {format_decimals(one.t_end, 1)}",
+                *(f"{format_digits(one.rmse)} {format_unit(one.unit)}", one.doing or None),
+            )
+            for one in windows
+        ],
+    )
 
 
 def _tell_sensitivity(results: Results, model: str) -> str:
@@ -104,20 +119,6 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
         "share of the present residual that a smooth function of motion and load predicts on "
         "unseen trials. Errors and floors are of fits of the diagnosis, not those of Validation.",
     )
-
-
-def _tabulate_sets(found: DiagnoseResult) -> Iterator[Block]:
-    """Yield the probable sets of effects, if there are several, and the null distribution."""
-    shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
-    if len(shown) > 1:
-        first = shown[0].log_evidence
-        rows = [
-            (phrases.name_set(s, "`"), phrases.probability(s.probability), s.log_evidence - first)
-            for s in shown[:_MOST_RANKED]
-        ]
-        columns = "Effects | >Probability | >Log evidence over the first (nats)"
-        yield Table("Sets of effects, the most probable first", columns, rows)
-    yield phrases.null_distribution(found.chance)
 
 
 def tabulate_candidates(
@@ -195,16 +196,3 @@ def draw_maps(panel: Any, name: str, shown: Sequence[tuple[ResidualMap, str, str
             panel.set(xlim=(-0.5, len(names) - 0.5), xlabel=split_name(name))
     panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
     style.set_limits(panel, bands, zero=True)
-
-
-def _tabulate_windows(windows: Sequence[WorstWindow]) -> Table:
-    rows = [
-        (
-            *(one.axis, one.trial_id),
-            f"{format_decimals(one.t_start, 1)} to {format_decimals(one.t_end, 1)}",
-            *(f"{format_digits(one.rmse)} {format_unit(one.unit)}", one.doing or None),
-        )
-        for one in windows[:_MOST_WINDOWS]
-    ]
-    title = "Worst windows: where the prediction fails most, and how the machine moved there"
-    return Table(title, "Axis | Trial | Time (s) | >RMSE | Motion ~1", rows)

@@ -38,8 +38,11 @@ def list_blocks(results: Results) -> Iterator[Block]:
                 yield Formulas(tuple(f"{n}: {e.expression}" for n, e in effects.items()))
             maps = diagnosis.maps.get(axis, {}) if diagnosis else {}
             yield _draw(f"draft-{model}-{axis}", axis, one, effects, maps)
-            if one.nearest:
-                yield _tabulate_nearest(one)
+            errors = {f"`{near.effect}`": near.held_out_rmse for near in one.nearest}
+            errors = {"the draft": one.rmse_after} | errors if errors else {}
+            title = "Most similar effects of the library: error on held-out trials"
+            rows = [(name, error, one.unit) for name, error in errors.items()]
+            yield Table(title, "Effect | >With it | Unit :unit", rows)
         drafted, own = set(found.selected), set(results.effects(model))
         later = (set(results.effects(name)) for name in results.models)
         if not drafted or not any(drafted <= effects - own for effects in later):
@@ -120,11 +123,3 @@ def _draw_gains(panel: Axes, entry: AxisDraft) -> None:
     names = ["first formula", "second"][: len(entry.chance)]
     panel.set_xticks(range(len(names)), names)
     panel.set(xlim=(-0.5, len(names) - 0.2), ylabel="gain")
-
-
-def _tabulate_nearest(entry: AxisDraft) -> Table:
-    errors = {"the draft": entry.rmse_after}
-    errors |= {f"`{near.effect}`": near.held_out_rmse for near in entry.nearest}
-    title = "Most similar effects of the library: error on held-out trials"
-    rows = [(name, error, entry.unit) for name, error in errors.items()]
-    return Table(title, "Effect | >With it | Unit :unit", rows)

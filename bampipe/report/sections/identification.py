@@ -22,7 +22,7 @@ from bampipe.report.wording import (
     format_with_sd,
     name_parameter,
 )
-from bampipe.results.identify import BaseEstimate, IdentifyResult, ParameterEstimate, StateBound
+from bampipe.results.identify import IdentifyResult, ParameterEstimate
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.validate import ValidateResult
 
@@ -41,11 +41,27 @@ def list_blocks(results: Results) -> Iterator[Block | None]:
         yield results.state_undone("No parameters have been identified", "identify")
         return
     yield _tabulate_parameters(results, identified)
-    yield _tabulate_combinations(identified.base_parameters or ())
+    found = identified.base_parameters or ()
+    texts = [format_decimals(one.estimate, *find_digits(one.estimate, one.sd)) for one in found]
+    yield Table(
+        "Combinations of inertial numbers that motion determines",
+        "Combination ~3 | >Estimate | >SD :2 | >Drawing | Shown | Unit :unit",
+        [
+            (one.combination, text, one.sd, (one.drawn, one.drawn_sd), one.shown, one.unit)
+            for one, text in zip(found, texts, strict=True)
+        ],
+        "Shown: whether its SD is less than half of that of the drawing.",
+    )
     known = identified.identifiability.sentences if identified.identifiability else ()
     yield tuple(note for note in identified.notes if note not in known)
     yield _list_checks(identified)
-    yield _tabulate_states(results, identified.state_3sigma or {})
+    rows = []
+    for axis, one in results.order_axes(identified.state_3sigma or {}).items():
+        # The smoother before least squares gives no bound of position: no column of dashes.
+        place = "" if one.position is None else format_scaled(one.position, results.unit(axis))
+        rows.append((axis, place, format_scaled(one.velocity, results.rate_unit(axis))))
+    caption = f"Error of the filtered state, 3σ bounds{results.cite_paper('Table VI')}"
+    yield Table(caption, "Axis | >Position | >Velocity", rows).drop_empty_columns()
     trace = results.table(results.model_file("trace.parquet"))
     # Least squares stores at most one row per trial: nothing converges along the data.
     if trace is not None and len(trace) > trace["trial_id"].nunique():
@@ -123,20 +139,6 @@ def _select_parameters(identified: IdentifyResult) -> Mapping[str, ParameterEsti
     return {n: one for n, one in identified.parameters.items() if n not in identified.inertial}
 
 
-def _tabulate_combinations(bases: Sequence[BaseEstimate]) -> Table:
-    rows = []
-    for one in bases:
-        estimate = format_decimals(one.estimate, *find_digits(one.estimate, one.sd))
-        drawn = (one.drawn, one.drawn_sd)
-        rows.append((one.combination, estimate, one.sd, drawn, one.shown, one.unit))
-    return Table(
-        "Combinations of inertial numbers that motion determines",
-        "Combination ~3 | >Estimate | >SD :2 | >Drawing | Shown | Unit :unit",
-        rows,
-        "Shown: whether its SD is less than half of that of the drawing.",
-    )
-
-
 def _list_checks(identified: IdentifyResult) -> str:
     """Say when the filter settled, and whether its noise levels fit."""
     parts = []
@@ -164,16 +166,6 @@ def _list_checks(identified: IdentifyResult) -> str:
         shown = f"(the force lags by {format_with_sd(lag, sd)} ms)"
         text = f"No delay between force and encoders is shown {shown}."
     return " ".join([*parts, *([text] if sd > 0.0 else [])])
-
-
-def _tabulate_states(results: Results, bounds: Mapping[str, StateBound]) -> Table:
-    rows = []
-    for axis, one in results.order_axes(bounds).items():
-        # The smoother before least squares gives no bound of position: no column of dashes.
-        place = "" if one.position is None else format_scaled(one.position, results.unit(axis))
-        rows.append((axis, place, format_scaled(one.velocity, results.rate_unit(axis))))
-    caption = f"Error of the filtered state, 3σ bounds{results.cite_paper('Table VI')}"
-    return Table(caption, "Axis | >Position | >Velocity", rows).drop_empty_columns()
 
 
 def _group_parameters(

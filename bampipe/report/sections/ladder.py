@@ -1,6 +1,6 @@
 """The ladder: held-out error of each model version against the floor, and its parameters."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -32,25 +32,20 @@ def list_blocks(results: Results) -> Iterator[Block]:
     rungs = compared.ladder
     known = {axis for rung in rungs for axis in rung.held_out_rmse}
     axes = [axis for axis in results.axes if axis in known]
-    yield _tabulate_errors(results, rungs, axes)
-    yield _draw(results, rungs, axes)
-    yield from tabulate_runs(rungs, axes)
-    yield _tabulate_parameters(results, rungs, compared.parameters)
-    yield tuple(one.sentence for one in compared.moved)
-
-
-def _tabulate_errors(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
     rows = []
     for rung in rungs:
         cells = []
         for axis in axes:
             text, floor = format_digits(rung.held_out_rmse.get(axis)), rung.noise_floor.get(axis)
             cells.append(f"{text} ({format_digits(floor)})" if floor else text)
-        added = f"`{rung.added}`" if rung.added else ""
-        rows.append((_name_version(rungs, rung), added, *cells))
+        rows.append((_name_version(rungs, rung), f"`{rung.added}`" if rung.added else "", *cells))
     heads = (f">{axis} ({format_unit(results.force_unit(axis))})" for axis in axes)
     caption = "RMSE on the same held-out trials (noise floor)"
-    return Table(caption, " | ".join(("Version | Added", *heads)), rows)
+    yield Table(caption, " | ".join(("Version | Added", *heads)), rows)
+    yield _draw(results, rungs, axes)
+    yield from tabulate_runs(rungs, axes)
+    yield _tabulate_parameters(results, rungs, compared.parameters)
+    yield tuple(one.sentence for one in compared.moved)
 
 
 def tabulate_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Iterator[Table]:
@@ -131,8 +126,8 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
     figure, panels = style.make_grid(len(axes), len(axes), 2.3, extra=0.0, column_width=1.95)
     x = np.arange(len(rungs))
     for panel, axis in zip(panels, axes, strict=True):
-        error = _make_array(rung.held_out_rmse.get(axis) for rung in rungs)
-        floor = _make_array(rung.noise_floor.get(axis) for rung in rungs)
+        error = np.array([rung.held_out_rmse.get(axis) for rung in rungs], dtype=float)
+        floor = np.array([rung.noise_floor.get(axis) for rung in rungs], dtype=float)
         panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
         both = np.concatenate([error, floor])
@@ -171,10 +166,6 @@ def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
             parts.append(f"{axis} {verb if abs(change) >= 1.0 else 'does not change'}")
     changes = f": {join_names(parts)}" if parts else ""
     return f"Error on held-out trials by version, against the noise floor{changes}."
-
-
-def _make_array(found: Iterable[float | None]) -> np.ndarray:
-    return np.array([np.nan if value is None else value for value in found])
 
 
 def _tabulate_parameters(

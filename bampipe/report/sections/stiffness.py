@@ -10,7 +10,7 @@ from bampipe.report import style
 from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import choose_scale, format_scaled, format_with_sd, split_name
-from bampipe.results.stiffness import AxisStiffness, GearStiffness, StiffnessResult
+from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 
 TITLE = "Stiffness"
 
@@ -26,15 +26,6 @@ def list_blocks(results: Results) -> Iterator[Block]:
     if not axes and not found.gears:
         yield " ".join(notes) or "There are no locked trials."
         return
-    yield _tabulate_axes(results, axes)
-    yield _tabulate_gears(results, found.gears)
-    loops = results.table("stiffness/loops.parquet")
-    if loops is not None and len(loops):
-        yield _draw_loops(results, axes, loops)
-    yield notes
-
-
-def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
     rows = []
     poses: dict[str, str] = {}
     for axis, one in results.order_axes(axes).items():
@@ -53,34 +44,35 @@ def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table
     )
     if poses:
         note += f" Bandwidth √(K/M) at {'; '.join(poses)}."
-    return Table(
+    yield Table(
         f"Stiffness of the locked axes{results.cite_paper('Table I')}",
         "Axis | >Stiffness ~1.3 | >Cycles | >Loop width ~1 | >Loss per cycle ~1"
         " | >Bandwidth (rad/s) ~1 | >(Hz) ~0.5",
         rows,
         note,
     )
-
-
-def _tabulate_gears(results: Results, gears: Mapping[str, GearStiffness]) -> Table:
-    rows = []
-    for axis, gear in results.order_axes(gears).items():
+    gears = []
+    for axis, gear in results.order_axes(found.gears).items():
         stiffness, play = "not seen", "not crossed"
         if gear.stiffness is not None and gear.sd is not None:
             stiffness = format_scaled(gear.stiffness, gear.unit, sd=gear.sd)
         if gear.play is not None and gear.play_sd is not None:
             play = format_scaled(gear.play, gear.play_unit, sd=gear.play_sd)
         late = f"{format_with_sd(1e3 * gear.late_s, 1e3 * gear.late_sd)} ms"
-        rows.append((axis, stiffness, play, gear.explained, late, gear.side))
-    return Table(
+        gears.append((axis, stiffness, play, gear.explained, late, gear.side))
+    yield Table(
         "Gears with an encoder on either side",
         "Axis | >Stiffness ~1.3 | >Play ~1.3 | >Explained :% ~0.8 | >Read late by ~1"
         " | Second encoder ~1",
-        rows,
+        gears,
         "From the difference of the encoders against the load of the drive, less the drive's own"
         " friction and inertia. Explained: share of the variance of the difference that stiffness"
         " and play explain, after timing and the losses of the drive.",
     )
+    loops = results.table("stiffness/loops.parquet")
+    if loops is not None and len(loops):
+        yield _draw_loops(results, axes, loops)
+    yield notes
 
 
 def _draw_loops(results: Results, axes: Mapping[str, AxisStiffness], loops: pd.DataFrame) -> Figure:

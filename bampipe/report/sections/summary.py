@@ -38,16 +38,6 @@ _TERMS = (
 def list_blocks(results: Results) -> Iterator[Block]:
     """Yield the warnings, the verdict unless the set-up is wrong, and the findings."""
     setup = results.read(SetupResult)
-    yield from _list_warnings(results, setup)
-    if setup is None or not setup.mistakes:
-        yield verdicts.judge_session(results)
-    yield _describe_session(results)
-    yield _describe_ladder(results)
-    yield _tabulate_numbers(results)
-
-
-def _list_warnings(results: Results, setup: SetupResult | None) -> Iterator[Callout]:
-    """Yield the mistakes in the set-up, and the outdated results."""
     for mistake in setup.mistakes if setup else ():
         text = f"Once this is corrected, {mistake.evidence}."
         if mistake.alternatives:
@@ -61,6 +51,11 @@ def _list_warnings(results: Results, setup: SetupResult | None) -> Iterator[Call
         steps = ", ".join(f"`{step}`" for step in results.outdated)
         text = f"Run these again before relying on their results: {steps}."
         yield Callout("attention", "Some results are older than their inputs", text)
+    if setup is None or not setup.mistakes:
+        yield verdicts.judge_session(results)
+    yield _describe_session(results)
+    yield _describe_ladder(results)
+    yield _tabulate_numbers(results)
 
 
 def _describe_session(results: Results) -> str:

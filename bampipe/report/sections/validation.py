@@ -32,8 +32,33 @@ def list_blocks(results: Results) -> Iterator[Block]:
         said = "The predicted force has not been compared with the measured one"
         yield results.state_undone(said, "validate")
         return
-    yield _tabulate_axes(results, validated)
-    yield _tabulate_trials(results, validated)
+    rows = []
+    for axis, one in results.order_axes(validated.axes).items():
+        fit = None if one.fit_percent is None else format_decimals(one.fit_percent, 1)
+        errors = (one.held_out_rmse, one.noise_floor, one.rmse, one.rmse_without_friction)
+        rows.append((axis, *errors, fit, one.unit))
+    bands = {axis: f"at {format_digits(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()}
+    different = {*bands.values()}
+    each = join_names(map(" ".join, bands.items())) if len(different) != 1 else different.pop()
+    yield Table(
+        f"Error of the predicted force, model `{validated.model}`",
+        "Axis | >Held-out RMSE ~1 | >Noise floor ~1 | >RMSE, all trials ~1"
+        " | >RMSE without friction ~1.2 | >Fit (%) ~0.6 | Unit :unit",
+        rows,
+        f"Held out: {verdicts.describe_held_out(validated)}. Noise floor: the error that sensor "
+        "noise, quantisation and filtering alone would leave. Fit: share of the measured force "
+        "that is explained, as 100 (1 − held-out RMSE / standard deviation). Both forces are "
+        f"low-passed {each}.",
+    )
+    trials = []
+    for name, trial in validated.trials.items():
+        key = "held_out_rmse" if trial.held_out else "rmse"
+        # Zero: the axis rested, no sample counts.
+        by_axis = (getattr(trial.axes.get(axis), key, None) or None for axis in results.axes)
+        trials.append((name, trial.held_out, *by_axis))
+    heads = (f">{axis} ({format_unit(results.force_unit(axis))})" for axis in results.axes)
+    note = "–: the axis rested." if any(None in row for row in trials) else ""
+    yield Table("RMSE by trial", " | ".join(("Trial | Held out", *heads)), trials, note)
     if validated.forces:
         shown = join_names(
             f"{split_name(name)} {format_digits(one.rmse)} {format_unit(one.unit)}"
@@ -49,39 +74,6 @@ def list_blocks(results: Results) -> Iterator[Block]:
         yield _draw_forces(results, residuals)
         if velocity := _read_velocity(results, residuals):
             yield _draw_friction(results, residuals, velocity)
-
-
-def _tabulate_axes(results: Results, validated: ValidateResult) -> Table:
-    rows = []
-    for axis, one in results.order_axes(validated.axes).items():
-        fit = None if one.fit_percent is None else format_decimals(one.fit_percent, 1)
-        errors = (one.held_out_rmse, one.noise_floor, one.rmse, one.rmse_without_friction)
-        rows.append((axis, *errors, fit, one.unit))
-    bands = {axis: f"at {format_digits(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()}
-    different = {*bands.values()}
-    each = join_names(map(" ".join, bands.items())) if len(different) != 1 else different.pop()
-    return Table(
-        f"Error of the predicted force, model `{validated.model}`",
-        "Axis | >Held-out RMSE ~1 | >Noise floor ~1 | >RMSE, all trials ~1"
-        " | >RMSE without friction ~1.2 | >Fit (%) ~0.6 | Unit :unit",
-        rows,
-        f"Held out: {verdicts.describe_held_out(validated)}. Noise floor: the error that sensor "
-        "noise, quantisation and filtering alone would leave. Fit: share of the measured force "
-        "that is explained, as 100 (1 − held-out RMSE / standard deviation). Both forces are "
-        f"low-passed {each}.",
-    )
-
-
-def _tabulate_trials(results: Results, validated: ValidateResult) -> Table:
-    rows = []
-    for name, trial in validated.trials.items():
-        key = "held_out_rmse" if trial.held_out else "rmse"
-        # Zero: the axis rested, no sample counts.
-        errors = (getattr(trial.axes.get(axis), key, None) or None for axis in results.axes)
-        rows.append((name, trial.held_out, *errors))
-    heads = (f">{axis} ({format_unit(results.force_unit(axis))})" for axis in results.axes)
-    note = "–: the axis rested." if any(None in row for row in rows) else ""
-    return Table("RMSE by trial", " | ".join(("Trial | Held out", *heads)), rows, note)
 
 
 def _tabulate_drift(

@@ -23,7 +23,18 @@ def list_blocks(results: Results) -> Iterator[Block]:
     if found is None or not found.directions:
         return
     yield _compare(found.directions)
-    yield _tabulate(found.directions)
+    yield Table(
+        "Damping at the handle (N·s/m), along the components of its force",
+        "Direction | >Commanded | >Rendered by the brakes | >p :p | >Own friction"
+        " | >Felt by a hand",
+        [
+            (name, d.commanded, (d.estimate, d.sd), d.p_value, d.own_friction, d.felt)
+            for name, d in found.directions.items()
+        ],
+        "± one standard deviation over blocks of time. p: probability of so large a difference "
+        "from the command if there were none (two-sided, Student's t). Friction and inertia as "
+        "identified; the filter does not use the commands of the brakes.",
+    )
     trace = results.table(results.model_file("viscous.parquet"))
     if trace is not None and len(trace):
         yield _draw(results, found.directions, trace)
@@ -45,21 +56,6 @@ def _compare(directions: Mapping[str, Damping]) -> str:
     if any(one.felt_differs for one in tested.values()):
         parts.append("A hand feels more: the device's own viscous friction adds to the field.")
     return " ".join(parts)
-
-
-def _tabulate(directions: Mapping[str, Damping]) -> Table:
-    return Table(
-        "Damping at the handle (N·s/m), along the components of its force",
-        "Direction | >Commanded | >Rendered by the brakes | >p :p | >Own friction"
-        " | >Felt by a hand",
-        [
-            (name, d.commanded, (d.estimate, d.sd), d.p_value, d.own_friction, d.felt)
-            for name, d in directions.items()
-        ],
-        "± one standard deviation over blocks of time. p: probability of so large a difference "
-        "from the command if there were none (two-sided, Student's t). Friction and inertia as "
-        "identified; the filter does not use the commands of the brakes.",
-    )
 
 
 def _draw(results: Results, directions: Mapping[str, Damping], trace: pd.DataFrame) -> Figure:
