@@ -33,22 +33,11 @@ UNKNOWN = "not diagnosed"
 
 
 def build_trends(tables: Tables) -> TrendsResult:
-    """Return charts of every parameter and stiffness, and the verdict on each session.
+    """Return charts of stiffness and of the base models' parameters, and verdicts on the sessions.
 
     Args:
         tables: rows of the lab's tables, sessions in the order of their recording.
     """
-    charts = _make_charts(tables)
-    return TrendsResult(
-        schema="bampipe.trends/1",
-        fewest_sessions=FEWEST_SESSIONS,
-        series=tuple(charts),
-        sessions=tuple(_judge_session(row, tables, charts) for row in tables["sessions"]),
-    )
-
-
-def _make_charts(tables: Tables) -> list[ControlChart]:
-    """Chart the parameters of the base models, and the stiffnesses."""
     found: dict[tuple[str, str, str], list[tuple[str, float, float]]] = {}
     bases = (r for r in tables.get("parameters", ()) if r["model"] == BASE)
     rows = [(r, r["parameter"], r["estimate"]) for r in bases]
@@ -56,7 +45,13 @@ def _make_charts(tables: Tables) -> list[ControlChart]:
     for row, name, value in rows:
         entry = (row["session_id"], value, row["sd"])
         found.setdefault((row["device"], name, row["unit"]), []).append(entry)
-    return [make_chart(*key, entries) for key, entries in sorted(found.items())]
+    charts = [make_chart(*key, entries) for key, entries in sorted(found.items())]
+    return TrendsResult(
+        schema="bampipe.trends/1",
+        fewest_sessions=FEWEST_SESSIONS,
+        series=tuple(charts),
+        sessions=tuple(_judge_session(row, tables, charts) for row in tables["sessions"]),
+    )
 
 
 def _judge_session(row: TableRow, tables: Tables, charts: Sequence[ControlChart]) -> SessionVerdict:
