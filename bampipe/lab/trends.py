@@ -134,7 +134,25 @@ def _explain_shift(
         if judged.diagnosed:
             return DEVICE, f"{moved}; its diagnosis finds nothing missing: the device changed", ""
         return UNKNOWN, f"{moved}; no diagnosis has been made", _diagnose_command(judged)
-    back, still = _refit_outside(judged, outside, mine)
+    # With a model that has the effect, its estimates decide; without one, the effect accounts
+    # neither for a parameter of an axis on which nothing is missing, nor for a stiffness.
+    models = {r["model"] for r in mine["parameters"]} - {BASE}
+    largest = max(models, key=lambda name: (name.count("+"), name), default="")
+    chosen = judged.model if judged.model != BASE else largest
+    child = {r["parameter"]: r for r in mine["parameters"] if r["model"] == chosen}
+    clean = {
+        r["axis"]
+        for r in mine["verdicts"]
+        if r["model"] == BASE and r["verdict"] == "nothing_missing"
+    }
+    back: list[str] = []
+    still: list[str] = []
+    for chart, point in outside.items():
+        if row := child.get(chart.name):
+            inside = _is_within(chart, point, row["estimate"], row["sd"])
+            (back if inside else still).append(chart.name)
+        elif chart.name.startswith("stiffness.") or chart.name.rpartition(".")[2] in clean:
+            still.append(chart.name)
     sentence = phrases.describe_shift(moved, lacking, back, still)
     remedy = "" if back or still else f"bampipe extend {judged.session} --auto, then bampipe lab"
     return BOTH if still else EFFECT, sentence, remedy
@@ -167,36 +185,6 @@ def _select_verdicts(judged: SessionVerdict, verdicts: Sequence[TableRow]) -> li
     """Return the verdicts on the model that counts; on the base model where it has none."""
     model = judged.model if judged.diagnosed else BASE
     return [row for row in verdicts if row["model"] == model]
-
-
-def _refit_outside(
-    judged: SessionVerdict,
-    outside: Mapping[ControlChart, ChartPoint],
-    mine: Mapping[str, Sequence[TableRow]],
-) -> tuple[list[str], list[str]]:
-    """Return the parameters for which the missing effect accounts, and the others.
-
-    With a model that has the effect, its estimates decide; without one, the effect accounts neither
-    for a parameter of an axis on which nothing is missing, nor for a stiffness, which no model has.
-    """
-    models = {r["model"] for r in mine["parameters"]} - {BASE}
-    largest = max(models, key=lambda name: (name.count("+"), name), default="")
-    chosen = judged.model if judged.model != BASE else largest
-    child = {r["parameter"]: r for r in mine["parameters"] if r["model"] == chosen}
-    clean = {
-        r["axis"]
-        for r in mine["verdicts"]
-        if r["model"] == BASE and r["verdict"] == "nothing_missing"
-    }
-    back: list[str] = []
-    still: list[str] = []
-    for chart, point in outside.items():
-        if row := child.get(chart.name):
-            inside = _is_within(chart, point, row["estimate"], row["sd"])
-            (back if inside else still).append(chart.name)
-        elif chart.name.startswith("stiffness.") or chart.name.rpartition(".")[2] in clean:
-            still.append(chart.name)
-    return back, still
 
 
 def _is_within(chart: ControlChart, point: ChartPoint, value: float, sd: float) -> bool:
