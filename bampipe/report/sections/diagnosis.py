@@ -46,16 +46,23 @@ def _show_model(
     yield phrases.limits(found)
     lacking = [axis for axis in axes if axis in found.lacking]
     if found.ranking and lacking:
-        yield _tabulate_ranking(found.ranking)
+        rows = [
+            (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)))
+            for one in found.ranking[:_MOST_RANKED]
+        ]
+        more = len(found.ranking) - _MOST_RANKED
+        note = f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else ""
+        title, about = "Candidate effects, best first", "Axis | Indistinguishable from"
+        yield tabulate_candidates(title, rows, about, note).drop_empty_columns()
         shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
         if len(shown) > 1:
             first = shown[0].log_evidence
             sets = ((phrases.name_set(one, "`"), one) for one in shown[:_MOST_RANKED])
-            rows = [
-                (n, phrases.probability(s.probability), s.log_evidence - first) for n, s in sets
-            ]
-            columns = "Effects | >Probability | >Log evidence over the first (nats)"
-            yield Table("Sets of effects, the most probable first", columns, rows)
+            yield Table(
+                "Sets of effects, the most probable first",
+                "Effects | >Probability | >Log evidence over the first (nats)",
+                [(n, phrases.probability(s.probability), s.log_evidence - first) for n, s in sets],
+            )
         yield phrases.null_distribution(found.chance)
     yield _advise(results, found) if lacking else _tell_sensitivity(results, model)
     if found.suggested_trial is not None:
@@ -143,17 +150,6 @@ def tabulate_candidates(
         f"{note} Without and with: RMSE on held-out trials, one of them scaled by the weighted "
         "misfit. p: probability that replicates give any candidate such a gain.".lstrip(),
     )
-
-
-def _tabulate_ranking(ranking: Sequence[RankedEffect]) -> Table:
-    rows = [
-        (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)))
-        for one in ranking[:_MOST_RANKED]
-    ]
-    more = len(ranking) - _MOST_RANKED
-    note = f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else ""
-    title, about = "Candidate effects, best first", "Axis | Indistinguishable from"
-    return tabulate_candidates(title, rows, about, note).drop_empty_columns()
 
 
 def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Figure:

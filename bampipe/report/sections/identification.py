@@ -168,21 +168,15 @@ def _list_checks(identified: IdentifyResult) -> str:
     return " ".join([*parts, *([text] if sd > 0.0 else [])])
 
 
-def _group_parameters(
-    results: Results, parameters: Mapping[str, ParameterEstimate], trace: pd.DataFrame
-) -> list[tuple[str, str, list[str]]]:
-    """Return title, unit and parameters of each panel: those of one kind and unit together."""
-    groups: dict[tuple[str, str], list[str]] = {}
+def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
+    parameters = _select_parameters(identified)
+    by_kind: dict[tuple[str, str], list[str]] = {}
     for name in results.order_parameters(parameters):
         if name in trace.columns:
             is_base = name.startswith(("viscous.", "coulomb."))
             kind = name_parameter(name.split(".")[0] if is_base else name)
-            groups.setdefault((kind, parameters[name].unit), []).append(name)
-    return [(kind, unit, names) for (kind, unit), names in groups.items()]
-
-
-def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
-    groups = _group_parameters(results, _select_parameters(identified), trace)
+            by_kind.setdefault((kind, parameters[name].unit), []).append(name)
+    groups = [(kind, unit, names) for (kind, unit), names in by_kind.items()]
     few = [n for n in _PANEL_COLUMNS if len(groups) <= n * _MOST_PANEL_ROWS] or _PANEL_COLUMNS[-1:]
     columns = min(few, key=lambda columns: (-len(groups) % columns, columns))
     figure, panels = style.make_grid(len(groups), columns, 1.35)
@@ -256,35 +250,29 @@ def _draw_motion(results: Results) -> Figure | None:
     kinds = [members for members in kinds if members]
     rows = 2 if any(f"torque_user_{axis}" in columns for axis in results.axes) else 1
     figure, panels = style.make_panels(rows, len(kinds), 1.9 * rows + 0.3, sharex=True)
+    t = frame["t"].to_numpy()
     for column, members in enumerate(kinds):
-        _draw_axes(results, list(panels[:, column]), frame, members)
+        top, bottom = panels[0, column], panels[-1, column]
+        for axis in members:
+            colour = style.SERIES[results.axes.index(axis) % len(style.SERIES)]
+            for name, title, panel, dashes in (
+                (f"torque_user_{axis}", f"{axis}, {results.pusher}", top, "-"),
+                (f"torque_gravity_{axis}", f"{axis}, gravity compensation", top, (0, (3, 1.5))),
+                (f"q_{axis}", axis, bottom, "-"),
+            ):
+                if name in frame:
+                    look: dict[str, Any] = {"lw": 0.9, "ls": dashes}
+                    style.draw_series(panel, t, frame[name].to_numpy(), colour, title, **look)
+        first = members[0]
+        top.set_ylabel(style.label_axis(results.name_force(first), results.force_unit(first)))
+        bottom.set_ylabel(style.label_axis("position", results.unit(first)))
+        bottom.set_xlabel("time (s)")
+        for panel in panels[:, column]:
+            panel.legend(loc="upper right", ncols=2)
+            low, high = panel.get_ylim()
+            panel.set_ylim(low, high + 0.22 * (high - low))
     forces = f"generalised forces of the {results.pusher}"
     if any(f"torque_gravity_{axis}" in columns for axis in axes):
         forces += " and of the gravity compensator"
     caption = f"Trial {trial}{results.cite_paper('Fig. 6')}: {forces} (top) and motion (bottom)."
     return style.finish(figure, "torques-and-motion", caption)
-
-
-def _draw_axes(
-    results: Results, panels: Sequence[Any], frame: pd.DataFrame, members: Sequence[str]
-) -> None:
-    """Draw the forces of some axes of one kind into the first panel, positions into the last."""
-    t = frame["t"].to_numpy()
-    for axis in members:
-        colour = style.SERIES[results.axes.index(axis) % len(style.SERIES)]
-        for name, title, panel, dashes in (
-            (f"torque_user_{axis}", f"{axis}, {results.pusher}", panels[0], "-"),
-            (f"torque_gravity_{axis}", f"{axis}, gravity compensation", panels[0], (0, (3, 1.5))),
-            (f"q_{axis}", axis, panels[-1], "-"),
-        ):
-            if name in frame:
-                look: dict[str, Any] = {"lw": 0.9, "ls": dashes}
-                style.draw_series(panel, t, frame[name].to_numpy(), colour, title, **look)
-    first = members[0]
-    panels[0].set_ylabel(style.label_axis(results.name_force(first), results.force_unit(first)))
-    panels[-1].set_ylabel(style.label_axis("position", results.unit(first)))
-    panels[-1].set_xlabel("time (s)")
-    for panel in panels:
-        panel.legend(loc="upper right", ncols=2)
-        low, high = panel.get_ylim()
-        panel.set_ylim(low, high + 0.22 * (high - low))

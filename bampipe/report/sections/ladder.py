@@ -139,21 +139,6 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
         panel.set_xticks(x, _name_ticks(rungs[0].model, error))
         panel.set(xlim=(-0.4, len(rungs) - 0.6), xlabel="version, and its error")
         panel.set(title=axis, ylabel=style.label_axis("RMSE", results.force_unit(axis)))
-    return style.finish(figure, "ladder", _describe_change(rungs, axes), panels[:1])
-
-
-def _name_ticks(first: str, error: np.ndarray) -> list[str]:
-    """Return each version with its error below; of many versions only the first and the last."""
-    names = [first, *(str(number) for number in range(1, len(error)))]
-    shown = range(len(error)) if len(error) <= _MOST_NUMBERS else (0, len(error) - 1)
-    return [
-        f"{name}\n{format_digits(float(value))}" if number in shown else name
-        for number, (name, value) in enumerate(zip(names, error, strict=True))
-    ]
-
-
-def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
-    """Return the change of the error of each axis from the first version to the last."""
     parts = []
     for axis in axes:
         before, after = (rung.held_out_rmse.get(axis) for rung in (rungs[0], rungs[-1]))
@@ -165,7 +150,18 @@ def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
             verb = f"{'falls' if change < 0.0 else 'rises'} by {size}"
             parts.append(f"{axis} {verb if abs(change) >= 1.0 else 'does not change'}")
     changes = f": {join_names(parts)}" if parts else ""
-    return f"Error on held-out trials by version, against the noise floor{changes}."
+    caption = f"Error on held-out trials by version, against the noise floor{changes}."
+    return style.finish(figure, "ladder", caption, panels[:1])
+
+
+def _name_ticks(first: str, error: np.ndarray) -> list[str]:
+    """Return each version with its error below; of many versions only the first and the last."""
+    names = [first, *(str(number) for number in range(1, len(error)))]
+    shown = range(len(error)) if len(error) <= _MOST_NUMBERS else (0, len(error) - 1)
+    return [
+        f"{name}\n{format_digits(float(value))}" if number in shown else name
+        for number, (name, value) in enumerate(zip(names, error, strict=True))
+    ]
 
 
 def _tabulate_parameters(

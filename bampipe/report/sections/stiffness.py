@@ -1,7 +1,6 @@
 """Stiffness: Table I, the hysteresis loops of Fig. 3, bandwidth in both units."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -79,30 +78,27 @@ def _draw_loops(results: Results, axes: Mapping[str, AxisStiffness], loops: pd.D
     names = [axis for axis in results.order_axes(axes) if (loops["axis"] == axis).any()]
     figure, panels = style.make_grid(len(names), len(names), 2.35, extra=0.0, column_width=2.0)
     for panel, axis in zip(panels, names, strict=True):
-        _draw_loop(results, panel, axis, axes[axis].stiffness, loops[loops["axis"] == axis])
+        rows = loops[loops["axis"] == axis]
+        rows = rows.iloc[style.thin(len(rows), 6000)]
+        deflection, torque = rows["deflection"].to_numpy(), rows["torque"].to_numpy()
+        deflection = deflection - 0.5 * (deflection.min() + deflection.max())
+        factor, unit = choose_scale([float(np.max(np.abs(deflection)))], results.unit(axis))
+        panel.plot(
+            factor * deflection, torque, color=style.FAINT, lw=0.6, label="around a reversal"
+        )
+        away = np.where(rows["post_yield"].to_numpy(dtype=bool), torque, np.nan)
+        panel.plot(factor * deflection, away, color=style.BLUE, lw=0.8, label="away from reversals")
+        middle, reach = 0.5 * (torque.max() + torque.min()), 0.5 * (torque.max() - torque.min())
+        line = np.array([-reach, reach])
+        panel.plot(
+            factor * line / axes[axis].stiffness, middle + line,
+            color=style.VERMILLION, ls=(0, (4, 2)), lw=1.2, label="stiffness",
+        )  # fmt: skip
+        panel.set(title=axis, xlabel=style.label_axis("deflection", unit))
+        panel.set_ylabel(style.label_axis(results.name_force(axis), results.force_unit(axis)))
     caption = (
         f"Hysteresis loops of the locked axes{results.cite_paper('Fig. 3')}: generalised force of "
         "the hand against deflection. The slope of the parts away from reversals (blue) is the "
         "stiffness (dashed)."
     )
     return style.finish(figure, "stiffness-loops", caption, panels[:1])
-
-
-def _draw_loop(
-    results: Results, panel: Any, axis: str, stiffness: float, rows: pd.DataFrame
-) -> None:
-    rows = rows.iloc[style.thin(len(rows), 6000)]
-    deflection, torque = rows["deflection"].to_numpy(), rows["torque"].to_numpy()
-    deflection = deflection - 0.5 * (deflection.min() + deflection.max())
-    factor, unit = choose_scale([float(np.max(np.abs(deflection)))], results.unit(axis))
-    panel.plot(factor * deflection, torque, color=style.FAINT, lw=0.6, label="around a reversal")
-    away = np.where(rows["post_yield"].to_numpy(dtype=bool), torque, np.nan)
-    panel.plot(factor * deflection, away, color=style.BLUE, lw=0.8, label="away from reversals")
-    middle, reach = 0.5 * (torque.max() + torque.min()), 0.5 * (torque.max() - torque.min())
-    line = np.array([-reach, reach])
-    panel.plot(
-        factor * line / stiffness, middle + line,
-        color=style.VERMILLION, ls=(0, (4, 2)), lw=1.2, label="stiffness",
-    )  # fmt: skip
-    panel.set(title=axis, xlabel=style.label_axis("deflection", unit))
-    panel.set_ylabel(style.label_axis(results.name_force(axis), results.force_unit(axis)))

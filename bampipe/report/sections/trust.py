@@ -42,11 +42,11 @@ def list_blocks(results: Results) -> Iterator[Block]:
             caption = "Growth of a bound without each trial, for the parameter that needs it most"
             yield Table(caption, "Trial | >Growth :% | Parameter :code", growth)
     is_published = identified.method == "ukf"
-    rows = []
+    rows, outcome = [], {True: "passes", False: "**fails**"}
     for axis, entry in results.order_axes(identified.innovations or {}).items():
         own, inputs = entry.whiteness, entry.inputs
-        white = (_tell_outcome(own.white), own.share) if own else (None, None)
-        driven = (_tell_outcome(inputs.independent), inputs.share) if inputs else (None, None)
+        white = (outcome[own.white], own.share) if own else (None, None)
+        driven = (outcome[inputs.independent], inputs.share) if inputs else (None, None)
         rows.append((axis, *white, *driven, entry.sentence if is_published else ""))
     note = (
         "White: Ljung-Box over one second. Inputs: regression on the inputs up to half a second "
@@ -81,7 +81,3 @@ def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
             f"`models/{identified.model}/identify.json` lists them."
         )
     return words
-
-
-def _tell_outcome(passed: bool) -> str:
-    return "passes" if passed else "**fails**"

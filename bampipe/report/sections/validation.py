@@ -1,7 +1,6 @@
 """Validation: measured and predicted force (Fig. 9), error without friction (Fig. 4), tables."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -191,7 +190,25 @@ def _draw_friction(
     for column, axis in enumerate(axes):
         top, bottom = panels[0, column], panels[1, column]
         kind, unit = results.name_force(axis), results.force_unit(axis)
-        _draw_movement(top, bottom, frame, axis, velocity[axis])
+        t, measured = frame["t"].to_numpy(), frame[f"torque_measured_{axis}"].to_numpy()
+        without = frame[f"torque_predicted_without_friction_{axis}"].to_numpy()
+        error = measured - without
+        one, keep = _find_movement(velocity[axis]), style.thin(len(error), 2500)
+        speed = velocity[axis]
+        top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5)
+        top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
+        count = len(speed[one])
+        if count >= 12:
+            start, ahead = count // 5, count // 5 + max(2, count // 25)
+            tail, head = ((speed[one][k], error[one][k]) for k in (start, ahead))
+            look = {"arrowstyle": "-|>", "color": style.VERMILLION, "mutation_scale": 13}
+            top.annotate("", xy=head, xytext=tail, arrowprops=look)
+        style.set_limits(top, [np.quantile(error, [0.001, 0.999]), error[one]])
+        shown = t[one] - t[one][0]
+        bottom.plot(shown, measured[one], color=style.INK, lw=1.4, label="measured")
+        bottom.plot(shown, without[one], color=style.ORANGE, ls=(0, (4, 1.5)), lw=1.1,
+                    label="predicted without friction")  # fmt: skip
+        bottom.axhline(0.0, color=style.INK, lw=0.5)
         top.set_title(style.break_heading(axis, len(axes)))
         top.set_xlabel(style.label_axis("velocity", results.rate_unit(axis)))
         bottom.set_xlabel("time (s)")
@@ -207,27 +224,3 @@ def _draw_friction(
         f"of one movement. {places[1]}: that movement."
     )
     return style.finish(figure, "error-without-friction", caption, [panels[0, 0], panels[1, 0]])
-
-
-def _draw_movement(
-    top: Any, bottom: Any, frame: pd.DataFrame, axis: str, speed: np.ndarray
-) -> None:
-    """Draw the error of a model without friction over speed, and below one movement over time."""
-    t, measured = frame["t"].to_numpy(), frame[f"torque_measured_{axis}"].to_numpy()
-    without = frame[f"torque_predicted_without_friction_{axis}"].to_numpy()
-    error = measured - without
-    one, keep = _find_movement(speed), style.thin(len(error), 2500)
-    top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5)
-    top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
-    count = len(speed[one])
-    if count >= 12:
-        start, ahead = count // 5, count // 5 + max(2, count // 25)
-        tail, head = ((speed[one][k], error[one][k]) for k in (start, ahead))
-        look = {"arrowstyle": "-|>", "color": style.VERMILLION, "mutation_scale": 13}
-        top.annotate("", xy=head, xytext=tail, arrowprops=look)
-    style.set_limits(top, [np.quantile(error, [0.001, 0.999]), error[one]])
-    shown = t[one] - t[one][0]
-    bottom.plot(shown, measured[one], color=style.INK, lw=1.4, label="measured")
-    bottom.plot(shown, without[one], color=style.ORANGE, ls=(0, (4, 1.5)), lw=1.1,
-                label="predicted without friction")  # fmt: skip
-    bottom.axhline(0.0, color=style.INK, lw=0.5)
