@@ -1,7 +1,7 @@
 """Collect the runs of a lab: tables, trends and a report, from all stages that have run."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -79,7 +79,14 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
             # matplotlib is slow to import: only here
             from bampipe.report.lab_report import build_lab_report
 
-            made = build_lab_report(folder, _find_pages(folder, roots))
+            # The folders of the sessions' reports, relative to the lab's.
+            reports = {root.name: root.resolve() / "report" for root in roots}
+            pages = {
+                name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
+                for name, report in reports.items()
+                if (report / "explore.html").is_file()
+            }
+            made = build_lab_report(folder, pages)
             made.write(folder)
             for old in (folder / "figures").glob("*.svg"):
                 if old.stem not in made.figures:
@@ -89,16 +96,6 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
         ).write(folder)
     return Lab(folder, content, sessions, tuple(skipped))
-
-
-def _find_pages(folder: Path, roots: Sequence[Path]) -> dict[str, str]:
-    """Return the folders of the sessions' reports, relative to the lab's."""
-    reports = {root.name: root.resolve() / "report" for root in roots}
-    return {
-        name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
-        for name, report in reports.items()
-        if (report / "explore.html").is_file()
-    }
 
 
 @contextmanager
