@@ -79,14 +79,6 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
     return used
 
 
-def list_drafts(root: Path, model: str) -> dict[str, Path]:
-    """Return the files of the effects that were drafted for ``model``, by ``name[:target]``."""
-    run = RunFolder(root)
-    found = run.find(DraftResult, model)
-    effects = found.effects.items() if found is not None else ()
-    return {name: run.path(effect.file) for name, effect in effects}
-
-
 def _find_effect(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | None]:
     """Return the effect ``name[:target]`` and its file, if it is not built in.
 
@@ -134,7 +126,8 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
             the parent has it already. No files remain.
     """
     root = options.request.root
-    drafts = list_drafts(root, parent)
+    run, drafted = RunFolder(root), RunFolder(root).find(DraftResult, parent)
+    drafts = {n: run.path(one.file) for n, one in drafted.effects.items()} if drafted else {}
     named = dict(_find_effect(effect, drafts) for effect in effects)
     child = models.child_name(parent, tuple(named))
     for name in named:

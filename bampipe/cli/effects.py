@@ -60,26 +60,21 @@ def effects(
             show.say(f"{copy}: every run in {runs} weighs it from its next diagnosis on")
     elif file is not None:
         raise InputError(f"{file!r} is one argument too many", remedy="bampipe effects NAME")
-    elif name is None:
-        list_all(json)
-    else:
+    elif name is not None:
         show_one(name, device, json)
+    else:
+        from bampipe.physics import registry
 
-
-def list_all(json: bool) -> None:
-    """Print every built-in effect: name, target, kind and summary."""
-    from bampipe.physics import registry
-
-    found = [registry.effect(name) for name in registry.effect_names()]
-    if json:
-        names = ("name", "scope", "kind", "summary")
-        show.print_json([{name: getattr(e, name) for name in names} for e in found])
-        return
-    show.print_table(
-        ["effect", "acts on", "kind", "summary"],
-        [[e.name, e.scope.replace("_", " "), e.kind, e.summary] for e in found],
-    )
-    show.say("\none in full: bampipe effects NAME")
+        found = [registry.effect(name) for name in registry.effect_names()]
+        if json:
+            names = ("name", "scope", "kind", "summary")
+            show.print_json([{name: getattr(e, name) for name in names} for e in found])
+            return
+        show.print_table(
+            ["effect", "acts on", "kind", "summary"],
+            [[e.name, e.scope.replace("_", " "), e.kind, e.summary] for e in found],
+        )
+        show.say("\none in full: bampipe effects NAME")
 
 
 def show_one(text: str, device_name: str, json: bool) -> None:

@@ -115,8 +115,11 @@ def export(
     from bampipe.run import models
 
     recordings = {"mcap": mcap_file.pack_recording, "rrd": rerun_file.pack_recording}
+    if form not in (every := (*FORMS, *recordings)):
+        what = f"unknown form {form!r}{did_you_mean(form, every)}"
+        raise InputError(what, remedy=f"--as {', '.join(every)}")
+    root = places.find_run(run, runs)
     if pack := recordings.get(form):
-        root = places.find_run(run, runs)
         path = out or Path(f"{root.name}.{form}")
         recording = gather_recording(RunFolder(root))
         with located(f"--as {form}"):
@@ -125,12 +128,7 @@ def export(
             stream.write(packed)
         show.say(f"{path}: {root.name}, {len(packed) / 1e6:.1f} MB")
         return
-    chosen = next((known for known in FORMS if known == form), None)
-    if chosen is None:
-        every = (*FORMS, *recordings)
-        what = f"unknown form {form!r}{did_you_mean(form, every)}"
-        raise InputError(what, remedy=f"--as {', '.join(every)}")
-    root = places.find_run(run, runs)
+    chosen = next(known for known in FORMS if known == form)
     counting = models.choose_model(root, model)
     text = export_model(RunFolder(root), counting, chosen)
     if out is None:

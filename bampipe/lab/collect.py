@@ -1,7 +1,7 @@
 """Collect the runs of a lab: tables, trends and a report, from all stages that have run."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -10,7 +10,6 @@ from urllib.parse import quote
 
 from bampipe.data import lab_tables
 from bampipe.errors import InputError
-from bampipe.files import atomic_writer, write_text
 from bampipe.lab import rows
 from bampipe.lab.folders import LOCK, is_foreign, run_folders
 from bampipe.lab.trends import build_trends
@@ -77,37 +76,26 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         content.write(folder)
         if report:
             progress(0.7, "report")
-            _write_report(folder, _find_pages(folder, roots))
+            # matplotlib is slow to import: only here
+            from bampipe.report.lab_report import build_lab_report
+
+            # The folders of the sessions' reports, relative to the lab's.
+            reports = {root.name: root.resolve() / "report" for root in roots}
+            pages = {
+                name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
+                for name, report in reports.items()
+                if (report / "explore.html").is_file()
+            }
+            made = build_lab_report(folder, pages)
+            made.write(folder)
+            for old in (folder / "figures").glob("*.svg"):
+                if old.stem not in made.figures:
+                    old.unlink()
         sessions = tuple(str(one.key["session_id"]) for one in found)
         LabResult(
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
         ).write(folder)
     return Lab(folder, content, sessions, tuple(skipped))
-
-
-def _find_pages(folder: Path, roots: Sequence[Path]) -> dict[str, str]:
-    """Return the folders of the sessions' reports, relative to the lab's."""
-    reports = {root.name: root.resolve() / "report" for root in roots}
-    return {
-        name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
-        for name, report in reports.items()
-        if (report / "explore.html").is_file()
-    }
-
-
-def _write_report(folder: Path, pages: Mapping[str, str]) -> None:
-    # matplotlib is slow to import: only here
-    from bampipe.report.lab_report import build_lab_report
-
-    made = build_lab_report(folder, pages)
-    with atomic_writer(folder / "report.pdf") as stream:
-        stream.write(made.pdf)
-    write_text(folder / "report.html", made.html)
-    for name, svg in made.figures.items():
-        write_text(folder / "figures" / f"{name}.svg", svg)
-    for old in (folder / "figures").glob("*.svg"):
-        if old.stem not in made.figures:
-            old.unlink()
 
 
 @contextmanager

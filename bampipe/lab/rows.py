@@ -63,12 +63,33 @@ def read_run(root: Path) -> SessionRows:
     for model in made:
         found = _add_model(run, rows, model, tuple(session.axes))
         nis = nis or found
-    _add_trials(run, rows, nis)
+    if run.exists("ingest/trials.parquet"):
+        frame = store.read_parquet(run.path("ingest/trials.parquet")).astype(object)
+        for trial in frame.where(frame.notna(), None).to_dict("records"):
+            rows.add("quality", nis=nis.get(trial["trial_id"]), **trial)
     stiffness = run.find(StiffnessResult)
     for axis, entry in stiffness.axes.items() if stiffness else ():
         interval = _make_interval(entry.stiffness, entry.sd)
         rows.add("stiffness", axis=axis, **entry.model_dump(), **interval)
-    _add_session(root, rows, session, made)
+    run_record = record.read(root)
+    states = [trial["status"] for trial in rows.tables.get("quality", ())]
+    verdicts = [gate.state for gate in run_record.gates]
+    counting = models.default_model(root)
+    had, has = (models.read(root, m).effects if m in made else () for m in (models.BASE, counting))
+    rows.add(
+        "sessions",
+        sample_rate_hz=session.sample_rate_hz,
+        trials=len(states),
+        trials_repaired=states.count("repaired"),
+        trials_set_aside=states.count("set_aside"),
+        models=list(made),
+        counting_model=counting,
+        effects=[effect for effect in has if effect not in had],
+        gates_failed=verdicts.count("failed"),
+        gates_warned=verdicts.count("warned"),
+        failures=[f"{step}: {text}" for step, text in sorted(run_record.failures.items())],
+        bampipe=run_record.versions.get("bampipe"),
+    )
     return rows
 
 
@@ -99,38 +120,6 @@ def _add_model(
             }
             rows.add("verdicts", model=model, axis=axis, **plain)
     return nis
-
-
-def _add_trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, float]) -> None:
-    if not run.exists("ingest/trials.parquet"):
-        return
-    frame = store.read_parquet(run.path("ingest/trials.parquet")).astype(object)
-    for trial in frame.where(frame.notna(), None).to_dict("records"):
-        rows.add("quality", nis=nis.get(trial["trial_id"]), **trial)
-
-
-def _add_session(
-    root: Path, rows: SessionRows, session: IngestResult, made: tuple[str, ...]
-) -> None:
-    run_record = record.read(root)
-    states = [trial["status"] for trial in rows.tables.get("quality", ())]
-    verdicts = [gate.state for gate in run_record.gates]
-    counting = models.default_model(root)
-    had, has = (models.read(root, m).effects if m in made else () for m in (models.BASE, counting))
-    rows.add(
-        "sessions",
-        sample_rate_hz=session.sample_rate_hz,
-        trials=len(states),
-        trials_repaired=states.count("repaired"),
-        trials_set_aside=states.count("set_aside"),
-        models=list(made),
-        counting_model=counting,
-        effects=[effect for effect in has if effect not in had],
-        gates_failed=verdicts.count("failed"),
-        gates_warned=verdicts.count("warned"),
-        failures=[f"{step}: {text}" for step, text in sorted(run_record.failures.items())],
-        bampipe=run_record.versions.get("bampipe"),
-    )
 
 
 def _make_interval(value: float, sd: float) -> dict[str, float]:

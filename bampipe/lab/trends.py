@@ -33,22 +33,11 @@ UNKNOWN = "not diagnosed"
 
 
 def build_trends(tables: Tables) -> TrendsResult:
-    """Return charts of every parameter and stiffness, and the verdict on each session.
+    """Return charts of stiffness and of the base models' parameters, and verdicts on the sessions.
 
     Args:
         tables: rows of the lab's tables, sessions in the order of their recording.
     """
-    charts = _make_charts(tables)
-    return TrendsResult(
-        schema="bampipe.trends/1",
-        fewest_sessions=FEWEST_SESSIONS,
-        series=tuple(charts),
-        sessions=tuple(_judge_session(row, tables, charts) for row in tables["sessions"]),
-    )
-
-
-def _make_charts(tables: Tables) -> list[ControlChart]:
-    """Chart the parameters of the base models, and the stiffnesses."""
     found: dict[tuple[str, str, str], list[tuple[str, float, float]]] = {}
     bases = (r for r in tables.get("parameters", ()) if r["model"] == BASE)
     rows = [(r, r["parameter"], r["estimate"]) for r in bases]
@@ -56,7 +45,13 @@ def _make_charts(tables: Tables) -> list[ControlChart]:
     for row, name, value in rows:
         entry = (row["session_id"], value, row["sd"])
         found.setdefault((row["device"], name, row["unit"]), []).append(entry)
-    return [make_chart(*key, entries) for key, entries in sorted(found.items())]
+    charts = [make_chart(*key, entries) for key, entries in sorted(found.items())]
+    return TrendsResult(
+        schema="bampipe.trends/1",
+        fewest_sessions=FEWEST_SESSIONS,
+        series=tuple(charts),
+        sessions=tuple(_judge_session(row, tables, charts) for row in tables["sessions"]),
+    )
 
 
 def _judge_session(row: TableRow, tables: Tables, charts: Sequence[ControlChart]) -> SessionVerdict:
@@ -139,7 +134,25 @@ def _explain_shift(
         if judged.diagnosed:
             return DEVICE, f"{moved}; its diagnosis finds nothing missing: the device changed", ""
         return UNKNOWN, f"{moved}; no diagnosis has been made", _diagnose_command(judged)
-    back, still = _refit_outside(judged, outside, mine)
+    # With a model that has the effect, its estimates decide; without one, the effect accounts
+    # neither for a parameter of an axis on which nothing is missing, nor for a stiffness.
+    models = {r["model"] for r in mine["parameters"]} - {BASE}
+    largest = max(models, key=lambda name: (name.count("+"), name), default="")
+    chosen = judged.model if judged.model != BASE else largest
+    child = {r["parameter"]: r for r in mine["parameters"] if r["model"] == chosen}
+    clean = {
+        r["axis"]
+        for r in mine["verdicts"]
+        if r["model"] == BASE and r["verdict"] == "nothing_missing"
+    }
+    back: list[str] = []
+    still: list[str] = []
+    for chart, point in outside.items():
+        if row := child.get(chart.name):
+            inside = _is_within(chart, point, row["estimate"], row["sd"])
+            (back if inside else still).append(chart.name)
+        elif chart.name.startswith("stiffness.") or chart.name.rpartition(".")[2] in clean:
+            still.append(chart.name)
     sentence = phrases.describe_shift(moved, lacking, back, still)
     remedy = "" if back or still else f"bampipe extend {judged.session} --auto, then bampipe lab"
     return BOTH if still else EFFECT, sentence, remedy
@@ -172,36 +185,6 @@ def _select_verdicts(judged: SessionVerdict, verdicts: Sequence[TableRow]) -> li
     """Return the verdicts on the model that counts; on the base model where it has none."""
     model = judged.model if judged.diagnosed else BASE
     return [row for row in verdicts if row["model"] == model]
-
-
-def _refit_outside(
-    judged: SessionVerdict,
-    outside: Mapping[ControlChart, ChartPoint],
-    mine: Mapping[str, Sequence[TableRow]],
-) -> tuple[list[str], list[str]]:
-    """Return the parameters for which the missing effect accounts, and the others.
-
-    With a model that has the effect, its estimates decide; without one, the effect accounts neither
-    for a parameter of an axis on which nothing is missing, nor for a stiffness, which no model has.
-    """
-    models = {r["model"] for r in mine["parameters"]} - {BASE}
-    largest = max(models, key=lambda name: (name.count("+"), name), default="")
-    chosen = judged.model if judged.model != BASE else largest
-    child = {r["parameter"]: r for r in mine["parameters"] if r["model"] == chosen}
-    clean = {
-        r["axis"]
-        for r in mine["verdicts"]
-        if r["model"] == BASE and r["verdict"] == "nothing_missing"
-    }
-    back: list[str] = []
-    still: list[str] = []
-    for chart, point in outside.items():
-        if row := child.get(chart.name):
-            inside = _is_within(chart, point, row["estimate"], row["sd"])
-            (back if inside else still).append(chart.name)
-        elif chart.name.startswith("stiffness.") or chart.name.rpartition(".")[2] in clean:
-            still.append(chart.name)
-    return back, still
 
 
 def _is_within(chart: ControlChart, point: ChartPoint, value: float, sd: float) -> bool:

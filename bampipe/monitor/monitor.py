@@ -54,12 +54,16 @@ class Monitor:
 
     def push(self, names: Sequence[str], values: Array) -> None:
         """Filter samples (T, m) with columns ``names``, as in a `StreamLayout`."""
+        brakes = {name: f"brake_{axis}" for axis, name in self.system.model.device.brakes.items()}
         for first in range(0, len(values), PORTION):
             part = values[first : first + PORTION]
             if not np.isfinite(self._first_t):
                 self._first_t = float(part[0, 0])
             t = part[:, 0].copy()
-            u = self._arrange_inputs(names, part)
+            given = dict(zip(names, part.T, strict=True)) | {"t": part[:, 0] - self._first_t}
+            absent = np.zeros(len(part))
+            columns = [given.get(brakes.get(name, name), absent) for name in self.system.inputs]
+            u = np.column_stack(columns) if columns else np.zeros((len(part), 0))
             q = part[:, [names.index(f"q_{axis}") for axis in self.system.coordinates]]
             self.samples += len(part)
             if self.start is None:
@@ -125,13 +129,6 @@ class Monitor:
         self.start = start
         self._test = WindowTest(len(self.system.coordinates), start.window)
         self._threshold = start.reference.threshold(self.options.probability)
-
-    def _arrange_inputs(self, names: Sequence[str], values: Array) -> Array:
-        brakes = {name: f"brake_{axis}" for axis, name in self.system.model.device.brakes.items()}
-        given = dict(zip(names, values.T, strict=True)) | {"t": values[:, 0] - self._first_t}
-        absent = np.zeros(len(values))
-        columns = [given.get(brakes.get(name, name), absent) for name in self.system.inputs]
-        return np.column_stack(columns) if columns else np.zeros((len(values), 0))
 
     def _filter_samples(self, t: Array, u: Array, q: Array) -> None:
         """Filter samples in stretches; a gap between them restarts the motion."""

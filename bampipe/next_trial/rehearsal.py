@@ -44,7 +44,14 @@ class Rehearsal:
         rng = np.random.default_rng([self.seed, 1 + version])
         given = design if version == 0 else follow_roughly(design, self.seen, rng, version == HASTY)
         t = np.arange(int(design.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
-        return self._observe(*self._path(given, t, rng, exact=version == 0), given, rng)
+        q, qd, qdd = self._path(given, t, rng, exact=version == 0)
+        system, forces = self.system, self.system.model.device.forces
+        motion = self._prescribe(q, qd, qdd, given)
+        # The design is the true motion; to first order its offset is that at the reading.
+        read = q - system.offset(q, motion.inputs(system.inputs), self.p)
+        applied = motion.inputs(forces)
+        recording = read_by_sensors(system, motion, read, applied, self.sensors, rng)
+        return self.kinematics.observe(recording, forces)
 
     def effort(self, series: Series) -> tuple[Array, Array]:
         """Return times (T,), s, and the drive force of each axis along a series, (T, n_q)."""
@@ -75,18 +82,6 @@ class Rehearsal:
             qdd[:, axis] = path[2] - drift * w**2 * np.sin(w * t + phase)
         return q, qd, qdd
 
-    def _observe(
-        self, q: Array, qd: Array, qdd: Array, design: Primitive, rng: np.random.Generator
-    ) -> Motion:
-        """Return the motion as sensors and filters give it, with the force that it needs."""
-        system, forces = self.system, self.system.model.device.forces
-        motion = self._prescribe(q, qd, qdd, design)
-        # The design is the true motion; to first order its offset is that at the reading.
-        read = q - system.offset(q, motion.inputs(system.inputs), self.p)
-        applied = motion.inputs(forces)
-        recording = read_by_sensors(system, motion, read, applied, self.sensors, rng)
-        return self.kinematics.observe(recording, forces)
-
     def _prescribe(self, q: Array, qd: Array, qdd: Array, design: Primitive) -> Motion:
         """Return the motion of the mechanism, with the force that it needs."""
         system, device = self.system, self.system.model.device
@@ -99,12 +94,9 @@ class Rehearsal:
             channels[brake] = design.field * self.seen.field[i] * np.abs(qd[:, i])
         for force in device.forces:
             channels |= {derivative(force, k): np.zeros(t.size) for k in range(LAST_ORDER + 1)}
-        return self._with_force(Motion("design", t, q, qd, qdd, np.zeros_like(q), channels))
-
-    def _with_force(self, motion: Motion) -> Motion:
-        """Return the motion with the force that leaves no residual."""
-        system, forces = self.system, self.system.model.device.forces
-        at = motion.kinematics
+        motion = Motion("design", t, q, qd, qdd, np.zeros_like(q), channels)
+        # The force that leaves no residual.
+        at, forces = motion.kinematics, device.forces
         for _ in range(_FORCE_STEPS):
             u = motion.inputs(system.inputs)
             z = system.memory(*at, u, self.p, motion.t)

@@ -40,12 +40,6 @@ def share_of_force(entry: AxisVerdict) -> str:
     return f"{percent_of_force(entry.explained)} of the mean square of the applied force"
 
 
-def times_floor(error: float, floor: float) -> str:
-    """Return an error as a multiple of its noise floor."""
-    ratio = f"{significant(error / floor)} times the noise floor" if floor > 0.0 else ""
-    return ratio or "without a noise floor"
-
-
 def list_effects(entry: AxisVerdict, effects: Iterable[str], mark: str = "") -> str:
     """Return ``a:yaw (0.98) and b:yaw (0.95)``: effects of an axis with their probabilities.
 
@@ -198,7 +192,10 @@ def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> 
         kept = {"rmse_after": entry.rmse_before, "explained": max(0.0, 1.0 - left)}
         entry = entry.model_copy(update=kept)
     before, error = significant(entry.rmse_before), significant(entry.rmse_after)
-    after = f"{error} {entry.unit}, {times_floor(entry.rmse_after, entry.noise_floor)}"
+    ratio = "without a noise floor"
+    if entry.noise_floor > 0.0:
+        ratio = f"{significant(entry.rmse_after / entry.noise_floor)} times the noise floor"
+    after = f"{error} {entry.unit}, {ratio}"
     share = f"explains {share_of_force(entry)}"
     errors = f"the held-out error is {after}, and the model {share}"
     if result.selected and (entry.effects or before != error):

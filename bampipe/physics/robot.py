@@ -153,7 +153,7 @@ class Row(NamedDeclaration):
     mass: Number = Field(default=0.0, description="Of the body behind it, kg")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of this row, m")
     inertia: Sextuple = (0.0,) * 6
-    """As of a joint's body, in the frame of this row"""
+    """Inertia of the body, in the frame of this row"""
 
 
 class Payload(Declaration):

@@ -6,7 +6,9 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 
+from bampipe.files import atomic_writer, write_text
 from bampipe.report import page, style, typeset
 from bampipe.report.document import Document, Figure, Section
 from bampipe.report.explorer.page import explorer_page
@@ -40,6 +42,16 @@ class Report:
         html = page.render_page(document, "explore.html" if explorer else "")
         return cls(typeset.render_pdf(document, recorded), html, explorer, figures, titles)
 
+    def write(self, folder: Path) -> None:
+        """Write the files below ``folder``, each whole or not at all."""
+        with atomic_writer(folder / "report.pdf", durable=False) as stream:
+            stream.write(self.pdf)
+        texts = {"report.html": self.html, "explore.html": self.explorer}
+        texts |= {f"figures/{name}.svg": svg for name, svg in self.figures.items()}
+        for name, text in texts.items():
+            if text:
+                write_text(folder / name, text, durable=False)
+
 
 def build_run_report(results: Results, progress: Callable[[float, str], None]) -> Report:
     """Return the report of ``results``; ``progress``: called with the share done."""
@@ -48,9 +60,7 @@ def build_run_report(results: Results, progress: Callable[[float, str], None]) -
         progress(0.7 * number / len(SECTIONS), name)
         module = importlib.import_module(f"bampipe.report.sections.{name}")
         with style.use_style():
-            blocks = tuple(module.list_blocks(results))
-        if blocks:
-            sections.append(Section(module.TITLE, blocks))
+            sections.append(Section.gather(module.TITLE, module.list_blocks(results)))
     session, seconds = results.session, 0
     parts = ["simulated"] if session.simulated else []
     parts.append(f"device {session.device} {session.device_serial}".rstrip())
@@ -60,7 +70,8 @@ def build_run_report(results: Results, progress: Callable[[float, str], None]) -
         seconds = max(0, int((when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()))
     if session.operator:
         parts.append(f"by {session.operator}")
-    document = Document(f"Session {session.session_id}", ", ".join(parts), tuple(sections))
+    shown = tuple(section for section in sections if section.blocks)
+    document = Document(f"Session {session.session_id}", ", ".join(parts), shown)
     progress(0.7, "page for exploring")
     explorer = explorer_page(results, document.subtitle)
     progress(0.85, "typesetting")

@@ -7,7 +7,7 @@ a page of our own, ``[words](../s01/report/report.html)``.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -51,24 +51,10 @@ def strip_marks(text: str) -> str:
 
 
 @dataclass(frozen=True)
-class Paragraph:
-    """A paragraph."""
-
-    text: str
-
-
-@dataclass(frozen=True)
 class Subheading:
     """A heading one level below that of the section."""
 
     text: str
-
-
-@dataclass(frozen=True)
-class Bullets:
-    """A list of short sentences."""
-
-    items: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -158,7 +144,8 @@ class Figure:
     svg: str
 
 
-Block = Paragraph | Subheading | Bullets | Formulas | Callout | Table | Figure
+Block = str | tuple[str, ...] | Subheading | Formulas | Callout | Table | Figure
+"""Text is a paragraph, several texts are a list."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +154,12 @@ class Section:
 
     title: str
     blocks: tuple[Block, ...]
+
+    @classmethod
+    def gather(cls, title: str, blocks: Iterable[Block | None]) -> Section:
+        """Return a section of the ``blocks`` that say something: no empty text, list or table."""
+        full = (b for b in blocks if b and not (isinstance(b, Table) and not b.rows))
+        return cls(title, tuple(full))
 
 
 @dataclass(frozen=True)

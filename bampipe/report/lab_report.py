@@ -12,7 +12,7 @@ from bampipe.lists import count_noun, join_names
 from bampipe.phrases import lab as phrases
 from bampipe.report import style
 from bampipe.report.build import Report
-from bampipe.report.document import Block, Callout, Document, Paragraph, Section, Table, Tone
+from bampipe.report.document import Block, Callout, Document, Section, Table, Tone
 from bampipe.report.wording import (
     choose_scale,
     format_digits,
@@ -69,7 +69,7 @@ def _summarise(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
         blocks.append(Callout("good" if judged else "note", title, text))
     if len(odd) > _MOST_CALLOUTS:
         more = count_noun(len(odd) - _MOST_CALLOUTS, "more session")
-        blocks.append(Paragraph(f"The table below has {more} that stand out."))
+        blocks.append(f"The table below has {more} that stand out.")
     links = {
         session: f"[{session}]({folder}/report.html) ([explore]({folder}/explore.html))"
         for session, folder in pages.items()
@@ -108,7 +108,7 @@ def _show_charts(trends: TrendsResult) -> Iterator[Section]:
         if all(len(chart.points) == 1 for chart in charts):
             name = charts[0].points[0].session
             text = f"This device has one session, {name}: there is nothing to compare."
-            yield Section(title, (Paragraph(text),))
+            yield Section(title, (text,))
             continue
         text = (
             "Each point is the estimate of a session with two standard deviations, for the base "
@@ -121,7 +121,7 @@ def _show_charts(trends: TrendsResult) -> Iterator[Section]:
             if any(chart.has_limits for chart in charts)
             else f"Control limits need {trends.fewest_sessions} sessions of this device."
         )
-        blocks: list[Block] = [Paragraph(text), _tabulate_charts(charts)]
+        blocks: list[Block] = [text, _tabulate_charts(charts)]
         for start in range(0, len(charts), _MOST_PANELS):
             part = charts[start : start + _MOST_PANELS]
             number = f"-{start // _MOST_PANELS + 1}" if len(charts) > _MOST_PANELS else ""
@@ -232,7 +232,7 @@ def _show_errors(folder: Path, trends: TrendsResult) -> Iterator[Section]:
         f"right. In the green band, below {AT_FLOOR:g}, only a diagnosis can find a further effect."
     )
     picture = style.finish(figure, "errors", caption, panels[:1])
-    yield Section("Prediction", (Paragraph(text), picture))
+    yield Section("Prediction", (text, picture))
 
 
 def _show_trials(folder: Path) -> Iterator[Section]:
@@ -246,19 +246,12 @@ def _show_trials(folder: Path) -> Iterator[Section]:
         f"{int((frame['status'] == 'repaired').sum())} repaired, "
         f"{int((frame['status'] == 'set_aside').sum())} set aside."
     )
-    blocks: list[Block] = [Paragraph(text)]
-    if not odd.empty:
-        rows = [
-            (
-                one.session_id,
-                one.trial_id,
-                split_name(one.status),
-                one.reason or one.repairs or None,
-            )
-            for one in odd.head(_MOST_TRIALS).itertuples()
-        ]
-        more = len(odd) - _MOST_TRIALS
-        note = f"{more} more in the table `quality`." if more > 0 else ""
-        title = "Trials that were not sound as recorded"
-        blocks.append(Table(title, "Session | Trial | Status | Reason ~1", rows, note))
-    yield Section("Trials", tuple(blocks))
+    rows = [
+        (one.session_id, one.trial_id, split_name(one.status), one.reason or one.repairs or None)
+        for one in odd.head(_MOST_TRIALS).itertuples()
+    ]
+    more = len(odd) - _MOST_TRIALS
+    note = f"{more} more in the table `quality`." if more > 0 else ""
+    title = "Trials that were not sound as recorded"
+    table = Table(title, "Session | Trial | Status | Reason ~1", rows, note)
+    yield Section.gather("Trials", (text, table))

@@ -8,12 +8,10 @@ from string import Template
 from bampipe.report import style
 from bampipe.report.document import (
     Block,
-    Bullets,
     Callout,
     Document,
     Figure,
     Formulas,
-    Paragraph,
     Subheading,
     Table,
     number_blocks,
@@ -66,12 +64,12 @@ def _render_spans(text: str, *, breaking: bool = False) -> str:
 
 def _render_block(block: Block, number: str) -> str:
     match block:
-        case Paragraph(text):
-            return f"<p>{_render_spans(text)}</p>"
+        case str():
+            return f"<p>{_render_spans(block)}</p>"
         case Subheading(text):
             return f"<h3>{_render_spans(text)}</h3>"
-        case Bullets(items):
-            rows = "".join(f"<li>{_render_spans(item)}</li>" for item in items)
+        case tuple():
+            rows = "".join(f"<li>{_render_spans(item)}</li>" for item in block)
             return f"<ul>{rows}</ul>"
         case Formulas(lines):
             rows = "".join(f"<div>{html.escape(line)}</div>" for line in lines)

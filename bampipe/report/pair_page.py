@@ -2,7 +2,7 @@
 
 from bampipe.lists import count_noun
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Callout, Document, Figure, Section, Table, Tone
+from bampipe.report.document import Block, Callout, Document, Figure, Section, Table, Tone
 from bampipe.report.page import render_page
 from bampipe.report.sections.diagnosis import draw_maps
 from bampipe.results.pair import PairResult
@@ -66,13 +66,12 @@ def build_page(pair: PairResult) -> str:
     changed |= any(one.failed for one in pair.journeys)
     tone: Tone = "attention" if changed else "good"
     verdict = "The device changed" if changed else "Nothing changed beyond chance"
-    blocks: list[Block] = [Callout(tone, verdict, "\n".join(pair.sentences))]
-    blocks += [Bullets(pair.notes)] * bool(pair.notes)
+    blocks: list[Block] = [Callout(tone, verdict, "\n".join(pair.sentences)), pair.notes]
     with style.use_style():
         blocks += [*tabulate_pair(pair), *(_draw_states(pair, a) for a in pair.journeys[0].axes)]
     title = f"{pair.first.session} and {pair.second.session}"
-    sections = (Section("What changed", tuple(blocks)),)
-    return render_page(Document(title, f"device {pair.device}", sections))
+    section = Section.gather("What changed", blocks)
+    return render_page(Document(title, f"device {pair.device}", (section,)))
 
 
 def _draw_states(pair: PairResult, axis: str) -> Figure:

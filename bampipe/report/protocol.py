@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from bampipe.report import typeset
-from bampipe.report.document import Block, Bullets, Document, Paragraph, Section, Table
+from bampipe.report.document import Block, Document, Section, Table
 from bampipe.report.sections.next_trial import tabulate_confusion, tabulate_sds
 from bampipe.report.wording import format_decimals
 from bampipe.results.next import Plan
@@ -38,22 +38,18 @@ def _sheet(
     plan: Plan, session: str, model: str, by_hand: bool, listed: int, scale: float
 ) -> Document:
     """Return the sheet with at most ``listed`` parameters."""
-    blocks: list[Block] = [Paragraph(plan.sentence)]
+    rows = [(f"{t.times} times" if t.times > 1 else "once", t.sentence, "") for t in plan.trials]
+    blocks: list[Block] = [
+        plan.sentence,
+        Table("Trials", " | Motion ~4 | Files ~1", rows),
+        _tabulate_uncertainties(plan, model, listed),
+        tabulate_confusion("Probability of confusion", ("now", "expected"), plan.confusion),
+    ]
+    sections = [Section.gather("The trials", blocks)]
     if plan.trials:
-        rows = [
-            (f"{t.times} times" if t.times > 1 else "once", t.sentence, "") for t in plan.trials
-        ]
-        blocks.append(Table("Trials", " | Motion ~4 | Files ~1", rows))
-    if plan.sd:
-        blocks.append(_tabulate_uncertainties(plan, model, listed))
-    if plan.confusion:
-        title = "Probability of confusion"
-        blocks.append(tabulate_confusion(title, ("now", "expected"), plan.confusion))
-    sections = [Section("The trials", tuple(blocks))]
-    if plan.trials:
-        before = Bullets((_BY_HAND if by_hand else _BY_DRIVE, *_BEFORE))
+        before = (_BY_HAND if by_hand else _BY_DRIVE, *_BEFORE)
         sections.insert(0, Section("Before each trial", (before,)))
-        sections.append(Section("After the last one", (Bullets(_AFTER),)))
+        sections.append(Section("After the last one", (_AFTER,)))
     about = f"Model {model}, {format_decimals(plan.seconds, 0)} s in all"
     return Document(f"Trials to record: {session}", about, tuple(sections), scale)
 

@@ -14,7 +14,6 @@ from bampipe.declarations.model import read_model_file
 from bampipe.errors import MissingResultError
 from bampipe.files import read_toml
 from bampipe.lists import join_names
-from bampipe.report.document import Paragraph
 from bampipe.results.compare import CompareResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.record import Result
@@ -142,16 +141,14 @@ class Results:
         compared = self.read(CompareResult)
         return compared.best if compared and compared.best in self.models else "base"
 
-    def state_undone(self, said: str, stage: str) -> Paragraph:
-        """Return the paragraph on a stage that has not run, with the command that runs it."""
-        return Paragraph(f"{said}: run `bampipe {stage} {self.root.name}`.")
+    def state_undone(self, said: str, stage: str) -> str:
+        """Return the sentence on a stage that has not run, with the command that runs it."""
+        return f"{said}: run `bampipe {stage} {self.root.name}`."
 
-    def state_next(self, advice: str) -> Paragraph:
-        """Return the paragraph on what to do next: a command for ``RUN``, or words."""
+    def state_next(self, advice: str) -> str:
+        """Return the sentence on what to do next: a command for ``RUN``, or words."""
         advice = advice.replace("RUN", self.root.name)
-        return Paragraph(
-            f"Next: `{advice}`" if advice.startswith("bampipe ") else f"Next: {advice}."
-        )
+        return f"Next: `{advice}`" if advice.startswith("bampipe ") else f"Next: {advice}."
 
     @property
     def diagnose_command(self) -> str:

@@ -101,6 +101,9 @@ def _print(document: Document, recorded: int) -> tuple[bytes, int]:
 
 def _describe_block(block: Block, number: str) -> dict[str, Any]:
     """Return the block as the template reads it, its text split into spans."""
+    if isinstance(block, str | tuple):
+        kind, name = ("paragraph", "text") if isinstance(block, str) else ("bullets", "items")
+        return {"kind": kind, "number": number, name: _split_spans(block)}
     shown: dict[str, Any] = {"kind": type(block).__name__.lower(), "number": number}
     for name, value in vars(block).items():
         if isinstance(block, Callout) and name == "text":

@@ -125,7 +125,13 @@ def draw_specimen(config: Config) -> tuple[Specimen, dict[str, float]]:
         raise InputError("an effect is named twice")
     full = Model(device, strengths, extra)
     rng = np.random.default_rng([config.seed, 0])
-    values = _draw_base_values(device, rng)
+    # The parameters of the device lie around their typical values or priors.
+    spread = {"viscous": 0.15, "coulomb": 0.1}
+    values = {}
+    for p in device.parameters:
+        nominal = p.prior if p.typical is None else p.typical
+        factor = 1.0 + spread.get(p.name.partition(".")[0], 0.003) * float(rng.uniform(-1.0, 1.0))
+        values[p.name] = p.prior if p.fixed else float(np.clip(nominal * factor, p.lower, p.upper))
     for item in full.effects:
         values |= _draw_effect_values(item, strengths[item.name], rng)
     for name, value in config.parameters.items():
@@ -162,17 +168,6 @@ def _read_strength(text: str, default: float) -> tuple[str, float]:
     if not 0 <= value < float("inf"):
         raise InputError(f"strength of effect {name!r} must not be negative, found {number}")
     return name, value
-
-
-def _draw_base_values(device: Device, rng: np.random.Generator) -> dict[str, float]:
-    """Draw the parameters of the device around their typical values or priors."""
-    spread = {"viscous": 0.15, "coulomb": 0.1}
-    values = {}
-    for p in device.parameters:
-        nominal = p.prior if p.typical is None else p.typical
-        factor = 1.0 + spread.get(p.name.partition(".")[0], 0.003) * float(rng.uniform(-1.0, 1.0))
-        values[p.name] = p.prior if p.fixed else float(np.clip(nominal * factor, p.lower, p.upper))
-    return values
 
 
 def _draw_effect_values(

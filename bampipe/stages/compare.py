@@ -57,7 +57,23 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         for key, found in run.read(IdentifyResult, name).parameters.items():
             parameters.setdefault(key, {})[name] = Value.of(found)
     confirmed = [name for name in order if ladder[name].confirmed]
-    moved = _moved(parameters, models, confirmed, config.sigmas)
+    # Parameters that a confirmed model changed by more than their uncertainty.
+    moved = []
+    for model in confirmed:
+        parent = models[model].parent
+        for name, by_model in parameters.items():
+            if parent not in by_model or model not in by_model:
+                continue
+            old, new = by_model[parent], by_model[model]
+            sd, change = math.hypot(old.sd, new.sd), new.estimate - old.estimate
+            if abs(change) > config.sigmas * sd:
+                sentence = (
+                    f"{name} moved from {round_with_sd(old.estimate, old.sd)} to"
+                    f" {round_with_sd(new.estimate, new.sd)} {new.unit}: without the effect it"
+                    " was biased."
+                )
+                of_model = {"parameter": name, "model": model, "parent": parent}
+                moved.append(Moved.of(new, **of_model, change=change, sd=sd, sentence=sentence))
     return CompareResult(
         best=best, ladder=tuple(ladder.values()), parameters=parameters, moved=tuple(moved)
     ).write(out)
@@ -89,29 +105,3 @@ def _rung(
     if before is None or not before.confirmed:
         return rung
     return rung.model_copy(update={"confirmed": rung.improves_on(before)})
-
-
-def _moved(
-    parameters: Mapping[str, Mapping[str, Value]],
-    models: Mapping[str, ModelFile],
-    confirmed: list[str],
-    sigmas: float,
-) -> list[Moved]:
-    """Parameters that a confirmed model changed by more than their uncertainty."""
-    moved = []
-    for model in confirmed:
-        parent = models[model].parent
-        for name, by_model in parameters.items():
-            if parent not in by_model or model not in by_model:
-                continue
-            old, new = by_model[parent], by_model[model]
-            sd, change = math.hypot(old.sd, new.sd), new.estimate - old.estimate
-            if abs(change) > sigmas * sd:
-                sentence = (
-                    f"{name} moved from {round_with_sd(old.estimate, old.sd)} to"
-                    f" {round_with_sd(new.estimate, new.sd)} {new.unit}: without the effect it"
-                    " was biased."
-                )
-                of_model = {"parameter": name, "model": model, "parent": parent}
-                moved.append(Moved.of(new, **of_model, change=change, sd=sd, sentence=sentence))
-    return moved

@@ -73,8 +73,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         InputError: fewer than two moving trials, a setting out of range, an axis that no force
             acts on, or a mistake in the set-up.
     """
-    if not config.trust_setup:
-        _require_sound_setup(run)
+    setup = None if config.trust_setup else run.find(SetupResult)
+    if setup is not None and setup.mistakes:
+        raise InputError(
+            f"no effect is looked for, since the set-up is wrong: {setup.mistakes[0].sentence}"
+            f" ({setup.mistakes[0].evidence})",
+            where=str(run.path(SetupResult.FILE)),
+            remedy="correct the session file and run it again, or --set trust_setup=true",
+        )
     model = load_model(run, config.model)
     system = compile_model(model)
     if system.undriven:
@@ -130,19 +136,6 @@ def _require_known(names: Sequence[str], recipe: Recipe, setting: str) -> None:
                 where=f"diagnose.{setting}",
                 remedy="`bampipe effects` lists them",
             )
-
-
-def _require_sound_setup(run: RunFolder) -> None:
-    """Refuse a diagnosis if the signals do not have their stated meaning."""
-    setup = run.find(SetupResult)
-    if setup is not None and setup.mistakes:
-        mistakes = setup.mistakes
-        raise InputError(
-            f"no effect is looked for, since the set-up is wrong: {mistakes[0].sentence}"
-            f" ({mistakes[0].evidence})",
-            where=str(run.path(SetupResult.FILE)),
-            remedy="correct the session file and run it again, or --set trust_setup=true",
-        )
 
 
 def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:

@@ -48,13 +48,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     from bampipe.report.run_results import Results
 
     report = build_run_report(Results(run.root, config.detail_model), progress)
-    folder = out / "report"
-    (folder / "figures").mkdir(parents=True, exist_ok=True)
-    (folder / "report.pdf").write_bytes(report.pdf)
-    (folder / "report.html").write_text(report.html, encoding="utf-8")
-    (folder / "explore.html").write_text(report.explorer, encoding="utf-8")
-    for name, svg in report.figures.items():
-        (folder / "figures" / f"{name}.svg").write_text(svg, encoding="utf-8")
+    report.write(out / "report")
     return {
         "sections": list(report.sections),
         "figures": sorted(report.figures),

@@ -230,27 +230,15 @@ def _loops_of(
     pose = np.median(q, axis=0)
     channels = {name: held[name] for name in system.inputs}
     motion = Motion(trial_id, grid.t, q, still, still, still, channels)
-    calibration = _calibration(system, session, motion, number, torque, deflection)
-    return _Loops(trial_id, pose, torque, deflection, rate, found, calibration)
-
-
-def _calibration(
-    system: System,
-    session: IngestResult,
-    motion: Motion,
-    number: int,
-    torque: Array,
-    deflection: Array,
-) -> dict[str, float]:
-    """Share of the stiffness of axis ``number`` that one standard uncertainty of each source is."""
     signals = Signals.of_session(system, session)
-    found = {}
+    # The share of the stiffness that one standard uncertainty of each source is.
+    calibration = {}
     for name, change in calibration_changes(signals):
         moved = change.of_motion(motion, signals)
         theirs = _applied(system, moved.q, moved.inputs(system.inputs), moved.t)[:, number]
         torques, deflections = _slope(theirs, torque), _slope(moved.q[:, number], deflection)
-        found[name] = torques / deflections - 1.0
-    return found
+        calibration[name] = torques / deflections - 1.0
+    return _Loops(trial_id, pose, torque, deflection, rate, found, calibration)
 
 
 def _applied(system: System, q: Array, u: Array, t: Array) -> Array:

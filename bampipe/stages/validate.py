@@ -31,7 +31,7 @@ from bampipe.schema import STRICT, Count
 from bampipe.trials.comparison import ComparedTrial, axis_errors, compare_trial
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
-from bampipe.trials.motion import Motion, trial_names, trial_sizes
+from bampipe.trials.motion import trial_names, trial_sizes
 from bampipe.trials.noise_floor import NoiseFloor, count_floor_replicates, draw_trials
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
 from bampipe.trials.residuals import rms
@@ -98,7 +98,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     free: FreeRun | None = None
     if config.free_run:
         progress(0.8, "free runs")
-        free = _run_freely(run, system, trials, compared, published, unseen)
+        motions, judged = trials.motions, [c.judged for c in compared]
+        parameters = [p[:-1] for p in unseen]
+        if trials.blocks:  # of the only trial, which runs as a whole
+            motions, held_out = read_motions(run, system, braked=True), held_out_trials(run)
+            judged = [motion.trial_id in held_out for motion in motions]
+            parameters = [published[:-1]] * len(motions)
+        drift = find_drift(system, motions, parameters, judged)
+        free = free_runs(run, system, motions, parameters, judged)
+        free = free.model_copy(update={"drift": drift})
     if system.model.device.robot is not None:
         notes += _silent_joints(system, compared, floor)
     with ParquetAppender(out / f"models/{config.model}/residuals.parquet") as file:
@@ -152,28 +160,6 @@ def _noise_floor(
                 f" floor of {significant(creeps)}."
             )
     return found.noise_floor, notes
-
-
-def _run_freely(
-    run: RunFolder,
-    system: System,
-    trials: MeasuredTrials,
-    compared: Sequence[ComparedTrial],
-    published: Array,
-    unseen: Sequence[Array],
-) -> FreeRun:
-    """Run the model freely, over whole trials and over short horizons."""
-    if trials.blocks:  # of the only trial, which runs as a whole
-        motions: Sequence[Motion] = read_motions(run, system, braked=True)
-        held_out = held_out_trials(run)
-        judged = [motion.trial_id in held_out for motion in motions]
-        parameters = [published[:-1]] * len(motions)
-    else:
-        motions, judged = trials.motions, [c.judged for c in compared]
-        parameters = [p[:-1] for p in unseen]
-    drift = find_drift(system, motions, parameters, judged)
-    found = free_runs(run, system, motions, parameters, judged)
-    return found.model_copy(update={"drift": drift})
 
 
 def _silent_joints(

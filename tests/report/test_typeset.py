@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from bampipe.report.document import Block, Document, Figure, Paragraph, Section, Table
+from bampipe.report.document import Block, Document, Figure, Section, Table
 from bampipe.report.typeset import render_pdf, render_sheet
 
 _POINT = 1.0 / 72.0
@@ -17,7 +17,7 @@ def drawing(height_cm: float) -> Figure:
 
 
 def lines(count: int) -> list[Block]:
-    return [Paragraph("One line of text.")] * count
+    return ["One line of text."] * count
 
 
 def document(*blocks: Block) -> Document:

@@ -81,10 +81,10 @@ def test_a_drive_that_wanders_does_not_tell_weight_from_a_spring() -> None:
     [
         ("weight", "angle [rad]", True, "gravity, since the motion shows it"),
         ("weight and cable", "angle [rad]", True, "neither weight nor a spring alone explains it"),
-        ("nothing", "angle [rad]", True, "assumed, as of any joint"),
+        ("nothing", "angle [rad]", True, "assumed, as for any joint"),
         ("nothing", "yaw [rad]", False, ""),
         ("nothing", "position[shoulder_pan_joint]", False, ""),
-        ("spring", "motor [rev]", True, "assumed, as of any joint"),
+        ("spring", "motor [rev]", True, "assumed, as for any joint"),
         ("spring", "angle [rad]", False, "no gravity: a torque follows the position as that of a"),
     ],
 )

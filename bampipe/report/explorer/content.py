@@ -259,10 +259,14 @@ def _describe_model(version: _Version) -> Content:
     }
 
 
+def _read_each(versions: Sequence[_Version], kind: type[R]) -> list[R | None]:
+    """Return a result of each model, None where it has none."""
+    return [one.session.results.read(kind, one.model) for one in versions]
+
+
 def _read_all(versions: Sequence[_Version], kind: type[R]) -> list[tuple[int, R]]:
     """Return a result of every model that has it, each with the number of the model."""
-    found = ((k, one.session.results.read(kind, one.model)) for k, one in enumerate(versions))
-    return [(number, one) for number, one in found if one is not None]
+    return [(k, one) for k, one in enumerate(_read_each(versions, kind)) if one is not None]
 
 
 def _list_maps(versions: Sequence[_Version]) -> list[Content]:
@@ -325,20 +329,16 @@ def _describe_effect(diagnosis: DiagnoseResult, axis: str, name: str, share: flo
 
 def _list_errors(results: Results, versions: Sequence[_Version]) -> Content:
     """Return, by axis, held-out error and noise floor of each version, in their order."""
-    validated = dict(_read_all(versions, ValidateResult))
     ladder: Content = {}
     for axis in results.axes:
-        errors = {n: one.axes[axis] for n, one in validated.items() if axis in one.axes}
-        found = [errors.get(number) for number in range(len(versions) if errors else 0)]
-        if found:
-            shown = ((one.held_out_rmse, one.noise_floor) if one else (None, None) for one in found)
-            ladder[axis] = [{"error": error, "floor": floor} for error, floor in shown]
+        found = [one and one.axes.get(axis) for one in _read_each(versions, ValidateResult)]
+        shown = [{"error": e and e.held_out_rmse, "floor": e and e.noise_floor} for e in found]
+        ladder |= {axis: shown} if any(found) else {}
     return ladder
 
 
 def _list_parameters(results: Results, versions: Sequence[_Version]) -> list[Content]:
-    known = dict(_read_all(versions, IdentifyResult))
-    identified = [known.get(number) for number in range(len(versions))]
+    identified = _read_each(versions, IdentifyResult)
     names = {name: p.unit for one in identified if one for name, p in one.parameters.items()}
     found = []
     for name in results.order_parameters(names):

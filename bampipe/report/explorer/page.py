@@ -7,7 +7,7 @@ from string import Template
 
 from bampipe.report import verdicts
 from bampipe.report.document import strip_marks
-from bampipe.report.explorer.content import Content, gather_content
+from bampipe.report.explorer.content import gather_content
 from bampipe.report.explorer.packing import Packer
 from bampipe.report.run_results import Results
 
@@ -39,11 +39,6 @@ def explorer_page(results: Results, subtitle: str, beside: Results | None = None
         lines = [strip_marks(line) for line in verdict.text.splitlines()]
         content["callouts"].append({"tone": verdict.tone, "title": title, "lines": lines})
     content["session"] = " and ".join(names)
-    return assemble_page(content, packer, subtitle)
-
-
-def assemble_page(content: Content, packer: Packer, subtitle: str) -> str:
-    """Return the page that shows ``content``, whose columns ``packer`` holds."""
     scripts = "\n".join(_read_asset(f"{name}.js") for name in SCRIPTS)
     blocks = "\n".join(
         f'<script type="text/plain" id="block-{number}">{text}</script>'

@@ -8,26 +8,12 @@ import numpy as np
 from bampipe.lists import count_noun, join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.report import style
-from bampipe.report.document import (
-    Block,
-    Bullets,
-    Callout,
-    Figure,
-    Paragraph,
-    Subheading,
-    Table,
-)
+from bampipe.report.document import Block, Callout, Figure, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.sections import next_trial
 from bampipe.report.wording import format_decimals, format_digits, format_unit, split_name
 from bampipe.results.compare import CompareResult
-from bampipe.results.diagnose import (
-    AxisVerdict,
-    DiagnoseResult,
-    RankedEffect,
-    ResidualMap,
-    WorstWindow,
-)
+from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, RankedEffect, ResidualMap
 from bampipe.results.draft import DraftResult
 from bampipe.results.next import NextResult
 
@@ -44,7 +30,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
     every = (results.read(DiagnoseResult, model) for model in results.models)
     found = [content for content in every if content is not None]
     if not found:
-        yield Paragraph(f"No model has been diagnosed yet: run `{results.diagnose_command}`.")
+        yield f"No model has been diagnosed yet: run `{results.diagnose_command}`."
     for content in found:
         if len(found) > 1:
             yield Subheading(f"Model `{content.model}`")
@@ -55,44 +41,70 @@ def _show_model(
     results: Results, found: DiagnoseResult, later: Mapping[str, Maps]
 ) -> Iterator[Block]:
     model, axes = found.model, results.order_axes(found.axes)
-    yield Bullets(tuple(entry.sentence for entry in axes.values()))
+    yield tuple(entry.sentence for entry in axes.values())
     yield _tabulate_verdicts(found, axes)
-    if limits := phrases.limits(found):
-        yield Paragraph(limits)
+    yield phrases.limits(found)
     lacking = [axis for axis in axes if axis in found.lacking]
     if found.ranking and lacking:
-        yield _tabulate_ranking(found.ranking)
-        yield from _tabulate_sets(found)
+        rows = [
+            (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)))
+            for one in found.ranking[:_MOST_RANKED]
+        ]
+        more = len(found.ranking) - _MOST_RANKED
+        note = f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else ""
+        title, about = "Candidate effects, best first", "Axis | Indistinguishable from"
+        yield tabulate_candidates(title, rows, about, note).drop_empty_columns()
+        shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
+        if len(shown) > 1:
+            first = shown[0].log_evidence
+            sets = ((phrases.name_set(one, "`"), one) for one in shown[:_MOST_RANKED])
+            yield Table(
+                "Sets of effects, the most probable first",
+                "Effects | >Probability | >Log evidence over the first (nats)",
+                [(n, phrases.probability(s.probability), s.log_evidence - first) for n, s in sets],
+            )
+        yield phrases.null_distribution(found.chance)
     yield _advise(results, found) if lacking else _tell_sensitivity(results, model)
     if found.suggested_trial is not None:
         yield Callout("note", "A trial that would tell more", found.suggested_trial.sentence)
     for axis in lacking:
         if maps := found.maps.get(axis):
             yield _draw_maps(model, axis, axes[axis].unit, maps, later.get(axis, {}))
-    if windows := [window for window in found.worst_windows if window.axis in lacking]:
-        yield _tabulate_windows(windows)
+    windows = [one for one in found.worst_windows if one.axis in lacking][:_MOST_WINDOWS]
+    yield Table(
+        "Worst windows: where the prediction fails most, and how the machine moved there",
+        "Axis | Trial | Time (s) | >RMSE | Motion ~1",
+        [
+            (
+                *(one.axis, one.trial_id),
+                f"{format_decimals(one.t_start, 1)} to {format_decimals(one.t_end, 1)}",
+                *(f"{format_digits(one.rmse)} {format_unit(one.unit)}", one.doing or None),
+            )
+            for one in windows
+        ],
+    )
 
 
-def _tell_sensitivity(results: Results, model: str) -> Paragraph:
+def _tell_sensitivity(results: Results, model: str) -> str:
     """Name the effects that these trials would not have revealed, if nothing is missing."""
     proposed = results.read(NextResult, model)
     if proposed is not None and proposed.sensitivity:
-        return Paragraph(f"{proposed.why} The table under {next_trial.TITLE} lists every effect.")
+        return f"{proposed.why} The table under {next_trial.TITLE} lists every effect."
     option = f" --model {model}" if len(results.models) > 1 else ""
-    return Paragraph(
+    return (
         f"`bampipe next {results.root.name}{option}` computes the size up to which an effect would"
         " go unnoticed in these trials, and the trial that would reveal it."
     )
 
 
-def _advise(results: Results, found: DiagnoseResult) -> Paragraph:
+def _advise(results: Results, found: DiagnoseResult) -> str:
     """Return the next command, or its result if it has been run."""
     compared, wanted = results.read(CompareResult), {*found.selected}
     for rung in compared.ladder if compared else ():
         if wanted and rung.parent == found.model and wanted == {*(rung.added or "").split(", ")}:
-            return Paragraph(f"Added since, as model `{rung.model}`.")
+            return f"Added since, as model `{rung.model}`."
     if found.next.startswith("bampipe draft ") and results.read(DraftResult, found.model):
-        return Paragraph("Drafted since (under Drafts).")
+        return "Drafted since (under Drafts)."
     return results.state_next(found.next)
 
 
@@ -114,20 +126,6 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
         "share of the present residual that a smooth function of motion and load predicts on "
         "unseen trials. Errors and floors are of fits of the diagnosis, not those of Validation.",
     )
-
-
-def _tabulate_sets(found: DiagnoseResult) -> Iterator[Block]:
-    """Yield the probable sets of effects, if there are several, and the null distribution."""
-    shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
-    if len(shown) > 1:
-        first = shown[0].log_evidence
-        rows = [
-            (phrases.name_set(s, "`"), phrases.probability(s.probability), s.log_evidence - first)
-            for s in shown[:_MOST_RANKED]
-        ]
-        columns = "Effects | >Probability | >Log evidence over the first (nats)"
-        yield Table("Sets of effects, the most probable first", columns, rows)
-    yield Paragraph(phrases.null_distribution(found.chance))
 
 
 def tabulate_candidates(
@@ -152,17 +150,6 @@ def tabulate_candidates(
         f"{note} Without and with: RMSE on held-out trials, one of them scaled by the weighted "
         "misfit. p: probability that replicates give any candidate such a gain.".lstrip(),
     )
-
-
-def _tabulate_ranking(ranking: Sequence[RankedEffect]) -> Table:
-    rows = [
-        (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)))
-        for one in ranking[:_MOST_RANKED]
-    ]
-    more = len(ranking) - _MOST_RANKED
-    note = f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else ""
-    title, about = "Candidate effects, best first", "Axis | Indistinguishable from"
-    return tabulate_candidates(title, rows, about, note).drop_empty_columns()
 
 
 def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Figure:
@@ -205,16 +192,3 @@ def draw_maps(panel: Any, name: str, shown: Sequence[tuple[ResidualMap, str, str
             panel.set(xlim=(-0.5, len(names) - 0.5), xlabel=split_name(name))
     panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
     style.set_limits(panel, bands, zero=True)
-
-
-def _tabulate_windows(windows: Sequence[WorstWindow]) -> Table:
-    rows = [
-        (
-            *(one.axis, one.trial_id),
-            f"{format_decimals(one.t_start, 1)} to {format_decimals(one.t_end, 1)}",
-            *(f"{format_digits(one.rmse)} {format_unit(one.unit)}", one.doing or None),
-        )
-        for one in windows[:_MOST_WINDOWS]
-    ]
-    title = "Worst windows: where the prediction fails most, and how the machine moved there"
-    return Table(title, "Axis | Trial | Time (s) | >RMSE | Motion ~1", rows)

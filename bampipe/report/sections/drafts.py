@@ -3,11 +3,10 @@
 from collections.abc import Iterator
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from bampipe.lists import join_names
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Formulas, Paragraph, Subheading, Table
+from bampipe.report.document import Block, Figure, Formulas, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import split_name
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
@@ -32,14 +31,17 @@ def list_blocks(results: Results) -> Iterator[Block]:
         diagnosis = results.read(DiagnoseResult, model)
         for axis, one in found.axes.items():
             yield Subheading(f"{axis.capitalize()}, model `{model}`")
-            yield Paragraph(one.sentence)
+            yield one.sentence
             effects = {name: found.effects[name] for name in one.effects}
             if effects:
                 yield Formulas(tuple(f"{n}: {e.expression}" for n, e in effects.items()))
             maps = diagnosis.maps.get(axis, {}) if diagnosis else {}
             yield _draw(f"draft-{model}-{axis}", axis, one, effects, maps)
-            if one.nearest:
-                yield _tabulate_nearest(one)
+            errors = {f"`{near.effect}`": near.held_out_rmse for near in one.nearest}
+            errors = {"the draft": one.rmse_after} | errors if errors else {}
+            title = "Most similar effects of the library: error on held-out trials"
+            rows = [(name, error, one.unit) for name, error in errors.items()]
+            yield Table(title, "Effect | >With it | Unit :unit", rows)
         drafted, own = set(found.selected), set(results.effects(model))
         later = (set(results.effects(name)) for name in results.models)
         if not drafted or not any(drafted <= effects - own for effects in later):
@@ -58,9 +60,37 @@ def _draw(
     figure, panels = style.make_grid(count, count, 2.3, extra=0.0, column_width=2.1)
     for panel, (effect_name, effect) in zip(panels, effects.items(), strict=False):
         residual = None if effect.curve.beside else maps.get(effect.curve.variable)
-        _draw_curve(panel, effect_name, effect, residual)
-    _draw_length(panels[-2], entry)
-    _draw_gains(panels[-1], entry)
+        curve = effect.curve
+        if residual is not None and effect.acts_as == "force":
+            centre, _ = style.scale_values(np.array(residual.center), residual.unit)
+            low, high, mean = (-np.array(v) for v in (residual.high, residual.low, residual.mean))
+            panel.fill_between(centre, low, high, color=style.VERMILLION, alpha=0.2, lw=0)
+            panel.plot(centre, mean, ".-", color=style.VERMILLION, ms=3.0, lw=0.8, label="residual")
+        band = (curve.at, curve.mean, curve.low, curve.high)
+        style.draw_curve(panel, band, curve.variable, curve.variable_unit, label="draft")
+        panel.set_title(split_name(effect_name.partition(":")[0]), fontsize="small")
+        kind = "torque" if curve.unit.startswith("N.m") else "force"
+        panel.set_ylabel(style.label_axis(kind, curve.unit))
+    panel = panels[-2]
+    counts = [option.constants for option in entry.options]
+    errors = [option.held_out_rmse for option in entry.options]
+    panel.plot(counts, errors, color=style.INK, marker="o", ms=3.5, lw=0.8)
+    panel.axhline(entry.noise_floor, color=style.BLUE, lw=0.8)
+    style.use_decades(panel, [*errors, entry.noise_floor])
+    panel.set(xticks=sorted(set(counts)), xlabel="constants")
+    panel.set_ylabel(style.label_axis("held-out error", entry.unit))
+    panel = panels[-1]
+    for number, one in enumerate(entry.chance):
+        replicates = np.full(len(one.gains), float(number))
+        panel.plot(replicates, one.gains, "o", color=style.BLUE, ms=3.0, alpha=0.6)
+        panel.plot([number], [one.gain], "D", color=style.VERMILLION, ms=4.0)
+    first = entry.chance[0]
+    for words, value in (("measured", first.gain), ("replicates", max(first.gains))):
+        panel.annotate(words, (0.0, value), (6, 0), textcoords="offset points", va="center")
+    panel.set_yscale("symlog", linthresh=10.0)
+    names = ["first formula", "second"][: len(entry.chance)]
+    panel.set_xticks(range(len(names)), names)
+    panel.set(xlim=(-0.5, len(names) - 0.2), ylabel="gain")
     if not effects:
         caption = (
             f"The search on {axis}: error on held-out trials against the number of constants, with "
@@ -80,51 +110,3 @@ def _draw(
         f"formula on the measured trials and on replicates that lack nothing.{drawn}"
     )
     return style.finish(figure, name, caption, panels[:1])
-
-
-def _draw_curve(
-    panel: Axes, name: str, effect: DraftedEffect, residual: ResidualMap | None
-) -> None:
-    curve = effect.curve
-    if residual is not None and effect.acts_as == "force":
-        centre, _ = style.scale_values(np.array(residual.center), residual.unit)
-        low, high, mean = (-np.array(v) for v in (residual.high, residual.low, residual.mean))
-        panel.fill_between(centre, low, high, color=style.VERMILLION, alpha=0.2, lw=0)
-        panel.plot(centre, mean, ".-", color=style.VERMILLION, ms=3.0, lw=0.8, label="residual")
-    band = (curve.at, curve.mean, curve.low, curve.high)
-    style.draw_curve(panel, band, curve.variable, curve.variable_unit, label="draft")
-    panel.set_title(split_name(name.partition(":")[0]), fontsize="small")
-    kind = "torque" if curve.unit.startswith("N.m") else "force"
-    panel.set_ylabel(style.label_axis(kind, curve.unit))
-
-
-def _draw_length(panel: Axes, entry: AxisDraft) -> None:
-    counts = [option.constants for option in entry.options]
-    errors = [option.held_out_rmse for option in entry.options]
-    panel.plot(counts, errors, color=style.INK, marker="o", ms=3.5, lw=0.8)
-    panel.axhline(entry.noise_floor, color=style.BLUE, lw=0.8)
-    style.use_decades(panel, [*errors, entry.noise_floor])
-    panel.set(xticks=sorted(set(counts)), xlabel="constants")
-    panel.set_ylabel(style.label_axis("held-out error", entry.unit))
-
-
-def _draw_gains(panel: Axes, entry: AxisDraft) -> None:
-    for number, one in enumerate(entry.chance):
-        replicates = np.full(len(one.gains), float(number))
-        panel.plot(replicates, one.gains, "o", color=style.BLUE, ms=3.0, alpha=0.6)
-        panel.plot([number], [one.gain], "D", color=style.VERMILLION, ms=4.0)
-    first = entry.chance[0]
-    for words, value in (("measured", first.gain), ("replicates", max(first.gains))):
-        panel.annotate(words, (0.0, value), (6, 0), textcoords="offset points", va="center")
-    panel.set_yscale("symlog", linthresh=10.0)
-    names = ["first formula", "second"][: len(entry.chance)]
-    panel.set_xticks(range(len(names)), names)
-    panel.set(xlim=(-0.5, len(names) - 0.2), ylabel="gain")
-
-
-def _tabulate_nearest(entry: AxisDraft) -> Table:
-    errors = {"the draft": entry.rmse_after}
-    errors |= {f"`{near.effect}`": near.held_out_rmse for near in entry.nearest}
-    title = "Most similar effects of the library: error on held-out trials"
-    rows = [(name, error, entry.unit) for name, error in errors.items()]
-    return Table(title, "Effect | >With it | Unit :unit", rows)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from bampipe.lists import join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Formulas, Paragraph, Subheading, Table
+from bampipe.report.document import Block, Figure, Formulas, Subheading
 from bampipe.report.run_results import Results
 from bampipe.report.sections.diagnosis import tabulate_candidates
 from bampipe.report.wording import format_digits, format_unit, format_with_sd, split_name
@@ -34,7 +34,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
     friction = [term for term in terms.terms if term.name.startswith("friction:")]
     effects = [term for term in terms.terms if term not in friction]
     if not effects:
-        yield Paragraph(f"Model `{results.model}` is the device without effects.")
+        yield f"Model `{results.model}` is the device without effects."
     if curves := [term.curves[0] for term in friction if term.curves]:
         caption = (
             "Identified friction of each axis with its 95 % band, over the motion of the trials."
@@ -42,22 +42,25 @@ def list_blocks(results: Results) -> Iterator[Block]:
         yield _draw_curves("friction", curves, caption)
     shown: set[str] = set()
     for term in effects:
-        yield from _show_effect(results, term, shown)
-    yield from _tabulate_weighed(results, {term.name for term in effects})
-
-
-def _show_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator[Block]:
-    """Yield the blocks of one effect; ``shown``: versions whose worst window is already drawn."""
-    text = term.text
-    yield Subheading(f"`{term.name}`")
-    yield Paragraph(f"{text.summary}. {_list_estimates(results, term)}".rstrip())
-    yield Formulas(text.formulas)
-    yield from _draw_effect(results, term, shown)
-    if text.on_the_machine:
-        yield Paragraph(f"**On the machine.** {text.on_the_machine}.")
-    yield Paragraph(f"**Diagnosis.** {_tell_alternatives(results, term.name)}")
-    if text.source:
-        yield Paragraph(f"**Source.** {text.source}.")
+        about = term.text
+        yield Subheading(f"`{term.name}`")
+        yield f"{about.summary}. {_list_estimates(results, term)}".rstrip()
+        yield Formulas(about.formulas)
+        yield from _draw_effect(results, term, shown)
+        yield f"**On the machine.** {about.on_the_machine}." if about.on_the_machine else ""
+        yield f"**Diagnosis.** {_tell_alternatives(results, term.name)}"
+        yield f"**Source.** {about.source}." if about.source else ""
+    # The candidates that the latest diagnosis weighed and that were not added.
+    added = {term.name for term in effects}
+    diagnosis = next((found for found in _read_diagnoses(results) if found.descriptions), None)
+    texts = diagnosis.descriptions if diagnosis else {}
+    rows = [
+        (one, [f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2])])
+        for one in (diagnosis.ranking if diagnosis else ())
+        if one.effect not in added and (text := texts.get(one.effect.partition(":")[0]))
+    ][:_MOST_CANDIDATES]
+    title = f"Weighed on model `{diagnosis.model if diagnosis else ''}`, best first"
+    yield tabulate_candidates(title, rows, "Description and formula ~2.6")
 
 
 def _list_estimates(results: Results, term: ModelTerm) -> str:
@@ -89,7 +92,7 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator
     name = f"effect-{term.name.replace(':', '-')}"
     curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_CURVE_SHARE]
     if term.curves and not curves:
-        yield Paragraph("No curve is drawn: no single variable accounts for a fifth of its force.")
+        yield "No curve is drawn: no single variable accounts for a fifth of its force."
     found = _find_window(results, term)
     if found is None or found.added in shown:
         yield from _draw_contribution(name, term, curves)
@@ -213,17 +216,3 @@ def _tell_alternatives(results: Results, effect: str) -> str:
         place = f"Alternatives: {join_names(named)}" if others else "No other effect is as likely"
         return f"Its probability is {phrases.probability(known[effect])}. {place}."
     return "No diagnosis of this run has compared it with other effects."
-
-
-def _tabulate_weighed(results: Results, added: set[str]) -> Iterator[Table]:
-    """Tabulate the candidates that the latest diagnosis weighed and that were not added."""
-    diagnosis = next((found for found in _read_diagnoses(results) if found.descriptions), None)
-    texts = diagnosis.descriptions if diagnosis else {}
-    rows = [
-        (one, [f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2])])
-        for one in (diagnosis.ranking if diagnosis else ())
-        if one.effect not in added and (text := texts.get(one.effect.partition(":")[0]))
-    ][:_MOST_CANDIDATES]
-    if diagnosis and rows:
-        title = f"Weighed on model `{diagnosis.model}`, best first"
-        yield tabulate_candidates(title, rows, "Description and formula ~2.6")

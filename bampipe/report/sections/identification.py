@@ -10,7 +10,7 @@ import pandas as pd
 from bampipe.lists import join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     find_digits,
@@ -22,7 +22,7 @@ from bampipe.report.wording import (
     format_with_sd,
     name_parameter,
 )
-from bampipe.results.identify import BaseEstimate, IdentifyResult, ParameterEstimate, StateBound
+from bampipe.results.identify import IdentifyResult, ParameterEstimate
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.validate import ValidateResult
 
@@ -34,28 +34,39 @@ _PANEL_COLUMNS, _MOST_PANEL_ROWS = (2, 3, 4), 7
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 
-def list_blocks(results: Results) -> Iterator[Block]:
+def list_blocks(results: Results) -> Iterator[Block | None]:
     """Yield the parameters, how they converged, and the motion."""
     identified = results.read(IdentifyResult)
     if identified is None:
         yield results.state_undone("No parameters have been identified", "identify")
         return
     yield _tabulate_parameters(results, identified)
-    if identified.base_parameters:
-        yield _tabulate_combinations(identified.base_parameters)
+    found = identified.base_parameters or ()
+    texts = [format_decimals(one.estimate, *find_digits(one.estimate, one.sd)) for one in found]
+    yield Table(
+        "Combinations of inertial numbers that motion determines",
+        "Combination ~3 | >Estimate | >SD :2 | >Drawing | Shown | Unit :unit",
+        [
+            (one.combination, text, one.sd, (one.drawn, one.drawn_sd), one.shown, one.unit)
+            for one, text in zip(found, texts, strict=True)
+        ],
+        "Shown: whether its SD is less than half of that of the drawing.",
+    )
     known = identified.identifiability.sentences if identified.identifiability else ()
-    if notes := tuple(note for note in identified.notes if note not in known):
-        yield Bullets(notes)
-    if checks := _list_checks(identified):
-        yield Paragraph(checks)
-    if identified.state_3sigma:
-        yield _tabulate_states(results, identified.state_3sigma)
+    yield tuple(note for note in identified.notes if note not in known)
+    yield _list_checks(identified)
+    rows = []
+    for axis, one in results.order_axes(identified.state_3sigma or {}).items():
+        # The smoother before least squares gives no bound of position: no column of dashes.
+        place = "" if one.position is None else format_scaled(one.position, results.unit(axis))
+        rows.append((axis, place, format_scaled(one.velocity, results.rate_unit(axis))))
+    caption = f"Error of the filtered state, 3σ bounds{results.cite_paper('Table VI')}"
+    yield Table(caption, "Axis | >Position | >Velocity", rows).drop_empty_columns()
     trace = results.table(results.model_file("trace.parquet"))
     # Least squares stores at most one row per trial: nothing converges along the data.
     if trace is not None and len(trace) > trace["trial_id"].nunique():
         yield _draw_convergence(results, identified, trace)
-    if motion := _draw_motion(results):
-        yield motion
+    yield _draw_motion(results)
 
 
 def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:
@@ -128,20 +139,6 @@ def _select_parameters(identified: IdentifyResult) -> Mapping[str, ParameterEsti
     return {n: one for n, one in identified.parameters.items() if n not in identified.inertial}
 
 
-def _tabulate_combinations(bases: Sequence[BaseEstimate]) -> Table:
-    rows = []
-    for one in bases:
-        estimate = format_decimals(one.estimate, *find_digits(one.estimate, one.sd))
-        drawn = (one.drawn, one.drawn_sd)
-        rows.append((one.combination, estimate, one.sd, drawn, one.shown, one.unit))
-    return Table(
-        "Combinations of inertial numbers that motion determines",
-        "Combination ~3 | >Estimate | >SD :2 | >Drawing | Shown | Unit :unit",
-        rows,
-        "Shown: whether its SD is less than half of that of the drawing.",
-    )
-
-
 def _list_checks(identified: IdentifyResult) -> str:
     """Say when the filter settled, and whether its noise levels fit."""
     parts = []
@@ -171,31 +168,15 @@ def _list_checks(identified: IdentifyResult) -> str:
     return " ".join([*parts, *([text] if sd > 0.0 else [])])
 
 
-def _tabulate_states(results: Results, bounds: Mapping[str, StateBound]) -> Table:
-    rows = []
-    for axis, one in results.order_axes(bounds).items():
-        # The smoother before least squares gives no bound of position: no column of dashes.
-        place = "" if one.position is None else format_scaled(one.position, results.unit(axis))
-        rows.append((axis, place, format_scaled(one.velocity, results.rate_unit(axis))))
-    caption = f"Error of the filtered state, 3σ bounds{results.cite_paper('Table VI')}"
-    return Table(caption, "Axis | >Position | >Velocity", rows).drop_empty_columns()
-
-
-def _group_parameters(
-    results: Results, parameters: Mapping[str, ParameterEstimate], trace: pd.DataFrame
-) -> list[tuple[str, str, list[str]]]:
-    """Return title, unit and parameters of each panel: those of one kind and unit together."""
-    groups: dict[tuple[str, str], list[str]] = {}
+def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
+    parameters = _select_parameters(identified)
+    by_kind: dict[tuple[str, str], list[str]] = {}
     for name in results.order_parameters(parameters):
         if name in trace.columns:
             is_base = name.startswith(("viscous.", "coulomb."))
             kind = name_parameter(name.split(".")[0] if is_base else name)
-            groups.setdefault((kind, parameters[name].unit), []).append(name)
-    return [(kind, unit, names) for (kind, unit), names in groups.items()]
-
-
-def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
-    groups = _group_parameters(results, _select_parameters(identified), trace)
+            by_kind.setdefault((kind, parameters[name].unit), []).append(name)
+    groups = [(kind, unit, names) for (kind, unit), names in by_kind.items()]
     few = [n for n in _PANEL_COLUMNS if len(groups) <= n * _MOST_PANEL_ROWS] or _PANEL_COLUMNS[-1:]
     columns = min(few, key=lambda columns: (-len(groups) % columns, columns))
     figure, panels = style.make_grid(len(groups), columns, 1.35)
@@ -269,35 +250,29 @@ def _draw_motion(results: Results) -> Figure | None:
     kinds = [members for members in kinds if members]
     rows = 2 if any(f"torque_user_{axis}" in columns for axis in results.axes) else 1
     figure, panels = style.make_panels(rows, len(kinds), 1.9 * rows + 0.3, sharex=True)
+    t = frame["t"].to_numpy()
     for column, members in enumerate(kinds):
-        _draw_axes(results, list(panels[:, column]), frame, members)
+        top, bottom = panels[0, column], panels[-1, column]
+        for axis in members:
+            colour = style.SERIES[results.axes.index(axis) % len(style.SERIES)]
+            for name, title, panel, dashes in (
+                (f"torque_user_{axis}", f"{axis}, {results.pusher}", top, "-"),
+                (f"torque_gravity_{axis}", f"{axis}, gravity compensation", top, (0, (3, 1.5))),
+                (f"q_{axis}", axis, bottom, "-"),
+            ):
+                if name in frame:
+                    look: dict[str, Any] = {"lw": 0.9, "ls": dashes}
+                    style.draw_series(panel, t, frame[name].to_numpy(), colour, title, **look)
+        first = members[0]
+        top.set_ylabel(style.label_axis(results.name_force(first), results.force_unit(first)))
+        bottom.set_ylabel(style.label_axis("position", results.unit(first)))
+        bottom.set_xlabel("time (s)")
+        for panel in panels[:, column]:
+            panel.legend(loc="upper right", ncols=2)
+            low, high = panel.get_ylim()
+            panel.set_ylim(low, high + 0.22 * (high - low))
     forces = f"generalised forces of the {results.pusher}"
     if any(f"torque_gravity_{axis}" in columns for axis in axes):
         forces += " and of the gravity compensator"
     caption = f"Trial {trial}{results.cite_paper('Fig. 6')}: {forces} (top) and motion (bottom)."
     return style.finish(figure, "torques-and-motion", caption)
-
-
-def _draw_axes(
-    results: Results, panels: Sequence[Any], frame: pd.DataFrame, members: Sequence[str]
-) -> None:
-    """Draw the forces of some axes of one kind into the first panel, positions into the last."""
-    t = frame["t"].to_numpy()
-    for axis in members:
-        colour = style.SERIES[results.axes.index(axis) % len(style.SERIES)]
-        for name, title, panel, dashes in (
-            (f"torque_user_{axis}", f"{axis}, {results.pusher}", panels[0], "-"),
-            (f"torque_gravity_{axis}", f"{axis}, gravity compensation", panels[0], (0, (3, 1.5))),
-            (f"q_{axis}", axis, panels[-1], "-"),
-        ):
-            if name in frame:
-                look: dict[str, Any] = {"lw": 0.9, "ls": dashes}
-                style.draw_series(panel, t, frame[name].to_numpy(), colour, title, **look)
-    first = members[0]
-    panels[0].set_ylabel(style.label_axis(results.name_force(first), results.force_unit(first)))
-    panels[-1].set_ylabel(style.label_axis("position", results.unit(first)))
-    panels[-1].set_xlabel("time (s)")
-    for panel in panels:
-        panel.legend(loc="upper right", ncols=2)
-        low, high = panel.get_ylim()
-        panel.set_ylim(low, high + 0.22 * (high - low))

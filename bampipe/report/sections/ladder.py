@@ -1,12 +1,12 @@
 """The ladder: held-out error of each model version against the floor, and its parameters."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from bampipe.lists import join_names
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Figure, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
@@ -32,27 +32,20 @@ def list_blocks(results: Results) -> Iterator[Block]:
     rungs = compared.ladder
     known = {axis for rung in rungs for axis in rung.held_out_rmse}
     axes = [axis for axis in results.axes if axis in known]
-    yield _tabulate_errors(results, rungs, axes)
-    yield _draw(results, rungs, axes)
-    yield from tabulate_runs(rungs, axes)
-    if compared.parameters:
-        yield _tabulate_parameters(results, rungs, compared.parameters)
-    if compared.moved:
-        yield Bullets(tuple(one.sentence for one in compared.moved))
-
-
-def _tabulate_errors(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
     rows = []
     for rung in rungs:
         cells = []
         for axis in axes:
             text, floor = format_digits(rung.held_out_rmse.get(axis)), rung.noise_floor.get(axis)
             cells.append(f"{text} ({format_digits(floor)})" if floor else text)
-        added = f"`{rung.added}`" if rung.added else ""
-        rows.append((_name_version(rungs, rung), added, *cells))
+        rows.append((_name_version(rungs, rung), f"`{rung.added}`" if rung.added else "", *cells))
     heads = (f">{axis} ({format_unit(results.force_unit(axis))})" for axis in axes)
     caption = "RMSE on the same held-out trials (noise floor)"
-    return Table(caption, " | ".join(("Version | Added", *heads)), rows)
+    yield Table(caption, " | ".join(("Version | Added", *heads)), rows)
+    yield _draw(results, rungs, axes)
+    yield from tabulate_runs(rungs, axes)
+    yield _tabulate_parameters(results, rungs, compared.parameters)
+    yield tuple(one.sentence for one in compared.moved)
 
 
 def tabulate_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Iterator[Table]:
@@ -133,8 +126,8 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
     figure, panels = style.make_grid(len(axes), len(axes), 2.3, extra=0.0, column_width=1.95)
     x = np.arange(len(rungs))
     for panel, axis in zip(panels, axes, strict=True):
-        error = _make_array(rung.held_out_rmse.get(axis) for rung in rungs)
-        floor = _make_array(rung.noise_floor.get(axis) for rung in rungs)
+        error = np.array([rung.held_out_rmse.get(axis) for rung in rungs], dtype=float)
+        floor = np.array([rung.noise_floor.get(axis) for rung in rungs], dtype=float)
         panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
         both = np.concatenate([error, floor])
@@ -146,21 +139,6 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
         panel.set_xticks(x, _name_ticks(rungs[0].model, error))
         panel.set(xlim=(-0.4, len(rungs) - 0.6), xlabel="version, and its error")
         panel.set(title=axis, ylabel=style.label_axis("RMSE", results.force_unit(axis)))
-    return style.finish(figure, "ladder", _describe_change(rungs, axes), panels[:1])
-
-
-def _name_ticks(first: str, error: np.ndarray) -> list[str]:
-    """Return each version with its error below; of many versions only the first and the last."""
-    names = [first, *(str(number) for number in range(1, len(error)))]
-    shown = range(len(error)) if len(error) <= _MOST_NUMBERS else (0, len(error) - 1)
-    return [
-        f"{name}\n{format_digits(float(value))}" if number in shown else name
-        for number, (name, value) in enumerate(zip(names, error, strict=True))
-    ]
-
-
-def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
-    """Return the change of the error of each axis from the first version to the last."""
     parts = []
     for axis in axes:
         before, after = (rung.held_out_rmse.get(axis) for rung in (rungs[0], rungs[-1]))
@@ -172,11 +150,18 @@ def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
             verb = f"{'falls' if change < 0.0 else 'rises'} by {size}"
             parts.append(f"{axis} {verb if abs(change) >= 1.0 else 'does not change'}")
     changes = f": {join_names(parts)}" if parts else ""
-    return f"Error on held-out trials by version, against the noise floor{changes}."
+    caption = f"Error on held-out trials by version, against the noise floor{changes}."
+    return style.finish(figure, "ladder", caption, panels[:1])
 
 
-def _make_array(found: Iterable[float | None]) -> np.ndarray:
-    return np.array([np.nan if value is None else value for value in found])
+def _name_ticks(first: str, error: np.ndarray) -> list[str]:
+    """Return each version with its error below; of many versions only the first and the last."""
+    names = [first, *(str(number) for number in range(1, len(error)))]
+    shown = range(len(error)) if len(error) <= _MOST_NUMBERS else (0, len(error) - 1)
+    return [
+        f"{name}\n{format_digits(float(value))}" if number in shown else name
+        for number, (name, value) in enumerate(zip(names, error, strict=True))
+    ]
 
 
 def _tabulate_parameters(

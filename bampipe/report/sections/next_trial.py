@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
-from bampipe.report.document import Block, Bullets, Callout, Paragraph, Table
+from bampipe.report.document import Block, Callout, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits
 from bampipe.results.diagnose import DiagnoseResult
@@ -19,21 +19,33 @@ def list_blocks(results: Results) -> Iterator[Block]:
     if found is None:
         return
     yield Callout("note", "The next trial", found.sentence)
-    yield Paragraph(f"{found.why} {found.expected}")
+    yield f"{found.why} {found.expected}"
     if identified := results.read(IdentifyResult):
         forecasts = read_forecasts(results.root, results.model)
         lines = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
-        if lines:
-            yield Bullets(tuple(one.replace("RUN", results.root.name) for one in lines))
-    best = found.proposals[0]
-    if best.confusion:
-        heads = ("with the present trials", "with the next one")
-        yield tabulate_confusion("Probability of confusing two effects", heads, best.confusion)
-    if best.sd:
-        title = "Standard deviation of each parameter, now and with the next trial"
-        yield tabulate_sds(title, best.sd)
-    if found.sensitivity:
-        yield _tabulate_sensitivity(found.sensitivity)
+        yield tuple(one.replace("RUN", results.root.name) for one in lines)
+    best, heads = found.proposals[0], ("with the present trials", "with the next one")
+    yield tabulate_confusion("Probability of confusing two effects", heads, best.confusion)
+    yield tabulate_sds("Standard deviation of each parameter, now and with the next trial", best.sd)
+
+    def factor(pair: tuple[str, Detectable]) -> float:
+        return float("inf") if pair[1].smallest is None else pair[1].smallest / pair[1].typical
+
+    rows = []
+    for name, one in sorted(found.sensitivity.items(), key=factor, reverse=True):
+        sizes = (one.smallest, one.with_proposal, one.typical)
+        strength = one.parameter.rpartition(".")[2]
+        rows.append((name, one.axis or None, strength, *sizes, one.unit or "1"))
+    yield Table(
+        "The smallest strength of each effect that these trials would have revealed",
+        "Effect :code | Axis | Strength :code | >now :2 | >with the next :2 | >typical :2"
+        " | Unit :unit",
+        rows,
+        "With 90 % probability, for the typical shape of the effect. A dash: such trials do not "
+        "reveal it at any size, or the model's own parameters imitate it. Typical: the strength at "
+        "which it is clearly visible. A number may grow with the next trial: errors are means over "
+        "all trials, and the next one may excite an effect less than the present ones do.",
+    )
 
 
 def tabulate_confusion(
@@ -60,24 +72,3 @@ def tabulate_sds(title: str, entries: Mapping[str, ExpectedSd]) -> Table:
     wide = not all(one.is_sharp for one in entries.values())
     columns = "Parameter :code | >now :2 | >expected | >asked :2 | Unit :unit"
     return Table(title, columns, rows, note if wide else "").drop_empty_columns()
-
-
-def _tabulate_sensitivity(table: Mapping[str, Detectable]) -> Table:
-    def factor(pair: tuple[str, Detectable]) -> float:
-        return float("inf") if pair[1].smallest is None else pair[1].smallest / pair[1].typical
-
-    rows = []
-    for name, one in sorted(table.items(), key=factor, reverse=True):
-        sizes = (one.smallest, one.with_proposal, one.typical)
-        strength = one.parameter.rpartition(".")[2]
-        rows.append((name, one.axis or None, strength, *sizes, one.unit or "1"))
-    return Table(
-        "The smallest strength of each effect that these trials would have revealed",
-        "Effect :code | Axis | Strength :code | >now :2 | >with the next :2 | >typical :2"
-        " | Unit :unit",
-        rows,
-        "With 90 % probability, for the typical shape of the effect. A dash: such trials do not "
-        "reveal it at any size, or the model's own parameters imitate it. Typical: the strength at "
-        "which it is clearly visible. A number may grow with the next trial: errors are means over "
-        "all trials, and the next one may excite an effect less than the present ones do.",
-    )

@@ -4,10 +4,10 @@ Nothing here depends on when or where the stages ran: equal results give equal r
 the machine are in ``run.json``, and ``bampipe status`` prints them.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 
-from bampipe.report.document import Block, Paragraph, Subheading, Table
+from bampipe.report.document import Block, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.results.run import RunResult, StepRecord
 
@@ -19,37 +19,31 @@ def list_blocks(results: Results) -> Iterator[Block]:
     """Yield versions, files, stages and settings."""
     run = results.read(RunResult)
     if run is None:
-        yield Paragraph("This run folder has no run.json, so its provenance is not known.")
+        yield "This run folder has no run.json, so its provenance is not known."
         return
     stages = {name: made for name, made in run.stages.items() if name != "report"}
-    yield Paragraph(_list_versions(stages))
-    if "ingest" in stages:
-        read = stages["ingest"].inputs
-        rows = [(name, digest[:_DIGITS]) for name, digest in read.items()]
-        title = f"Files that were read (first {_DIGITS} digits of their hash)"
-        yield Table(title, "File :code | Hash :code", rows)
-    yield _tabulate_stages(stages)
-    if settings := _tabulate_settings(stages):
-        yield Subheading("Settings")
-        yield settings
-
-
-def _list_versions(stages: Mapping[str, StepRecord]) -> str:
     every = sorted({pair for made in stages.values() for pair in made.versions.items()})
     names = groupby(every, key=lambda pair: pair[0])
     shown = ", ".join(f"{n} {' and '.join(version for _, version in some)}" for n, some in names)
     text = f"Made with {shown}. " if shown else ""
-    return f"{text}Full hashes are in `run.json`; equal inputs and versions give equal results."
-
-
-def _tabulate_stages(stages: Mapping[str, StepRecord]) -> Table:
-    return Table(
+    yield f"{text}Full hashes are in `run.json`; equal inputs and versions give equal results."
+    read = stages["ingest"].inputs if "ingest" in stages else {}
+    yield Table(
+        f"Files that were read (first {_DIGITS} digits of their hash)",
+        "File :code | Hash :code",
+        [(name, digest[:_DIGITS]) for name, digest in read.items()],
+    )
+    ordered = _order_stages(stages)
+    yield Table(
         "Stages",
         "Stage :code | >Files | Key :code",
-        [(n, str(len(made.outputs)), made.key[:_DIGITS]) for n, made in _order_stages(stages)],
+        [(name, str(len(made.outputs)), made.key[:_DIGITS]) for name, made in ordered],
         "Key: hash of everything on which the stage depends (inputs, settings, code, versions). "
         "`bampipe status` says when each ran, and for how long.",
     )
+    if settings := _tabulate_settings(ordered):
+        yield Subheading("Settings")
+        yield settings
 
 
 def _order_stages(stages: Mapping[str, StepRecord]) -> list[tuple[str, StepRecord]]:
@@ -67,9 +61,9 @@ def _order_stages(stages: Mapping[str, StepRecord]) -> list[tuple[str, StepRecor
     return sorted(stages.items(), key=lambda item: (rank(item[0]), item[0]))
 
 
-def _tabulate_settings(stages: Mapping[str, StepRecord]) -> Table | None:
+def _tabulate_settings(stages: Sequence[tuple[str, StepRecord]]) -> Table | None:
     models: dict[tuple[str, str], list[str]] = {}
-    for name, made in _order_stages(stages):
+    for name, made in stages:
         stage, _, model = name.partition(":")
         config = {key: value for key, value in made.config.items() if key != "model"}
         shown = ", ".join(f"{key} = {_format_value(value)}" for key, value in config.items())

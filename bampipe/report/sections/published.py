@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from bampipe.files import read_json_table
-from bampipe.report.document import Block, Bullets, Callout, Subheading, Table
+from bampipe.report.document import Block, Callout, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import NONE, format_digits, format_unit, format_with_sd
 
@@ -36,27 +36,23 @@ def list_blocks(results: Results) -> Iterator[Block]:
         f"Paper: digits as printed there.{_explain_dash(rows)}",
     )
     if "comparison" in paper:
-        yield _tabulate_devices(results, paper["comparison"])
+        comparison = paper["comparison"]
+        rows = []
+        for row in comparison["rows"]:
+            parts = [_format_range(results, place) for place in row["session"]]
+            own = "; ".join(part for part in parts if part) or NONE
+            rows.append((row["quantity"], own, *row["published"]))
+        widths = (1.2, 0.95, 0.95, 0.9)
+        heads = (f"{name} ~{w}" for name, w in zip(comparison["devices"], widths, strict=True))
+        yield Table(
+            f"The device of this session beside others, as published ({comparison['place']})",
+            " | ".join((" ~0.9", "This session ~1.2", *heads)),
+            rows,
+            comparison["note"] + _explain_dash(rows),
+        )
     if notes := tuple(paper.get("notes", {}).get("text", ())):
         yield Subheading("Where this differs from the paper, and why")
-        yield Bullets(notes)
-
-
-def _tabulate_devices(results: Results, comparison: dict[str, Any]) -> Table:
-    """Return the device of this session beside others, as published."""
-    rows = []
-    for row in comparison["rows"]:
-        parts = [_format_range(results, place) for place in row["session"]]
-        own = "; ".join(part for part in parts if part) or NONE
-        rows.append((row["quantity"], own, *row["published"]))
-    widths = (1.2, 0.95, 0.95, 0.9)
-    heads = (f"{name} ~{w}" for name, w in zip(comparison["devices"], widths, strict=True))
-    return Table(
-        f"The device of this session beside others, as published ({comparison['place']})",
-        " | ".join((" ~0.9", "This session ~1.2", *heads)),
-        rows,
-        comparison["note"] + _explain_dash(rows),
-    )
+        yield notes
 
 
 def _explain_dash(rows: Iterable[tuple[str, ...]]) -> str:

@@ -1,16 +1,15 @@
 """Stiffness: Table I, the hysteresis loops of Fig. 3, bandwidth in both units."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import choose_scale, format_scaled, format_with_sd, split_name
-from bampipe.results.stiffness import AxisStiffness, GearStiffness, StiffnessResult
+from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 
 TITLE = "Stiffness"
 
@@ -24,20 +23,8 @@ def list_blocks(results: Results) -> Iterator[Block]:
         return
     axes, notes = found.axes, found.notes
     if not axes and not found.gears:
-        yield Paragraph(" ".join(notes) or "There are no locked trials.")
+        yield " ".join(notes) or "There are no locked trials."
         return
-    if axes:
-        yield _tabulate_axes(results, axes)
-    if found.gears:
-        yield _tabulate_gears(results, found.gears)
-    loops = results.table("stiffness/loops.parquet")
-    if loops is not None and len(loops):
-        yield _draw_loops(results, axes, loops)
-    if notes:
-        yield Bullets(notes)
-
-
-def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
     rows = []
     poses: dict[str, str] = {}
     for axis, one in results.order_axes(axes).items():
@@ -56,64 +43,62 @@ def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table
     )
     if poses:
         note += f" Bandwidth √(K/M) at {'; '.join(poses)}."
-    return Table(
+    yield Table(
         f"Stiffness of the locked axes{results.cite_paper('Table I')}",
         "Axis | >Stiffness ~1.3 | >Cycles | >Loop width ~1 | >Loss per cycle ~1"
         " | >Bandwidth (rad/s) ~1 | >(Hz) ~0.5",
         rows,
         note,
     )
-
-
-def _tabulate_gears(results: Results, gears: Mapping[str, GearStiffness]) -> Table:
-    rows = []
-    for axis, gear in results.order_axes(gears).items():
+    gears = []
+    for axis, gear in results.order_axes(found.gears).items():
         stiffness, play = "not seen", "not crossed"
         if gear.stiffness is not None and gear.sd is not None:
             stiffness = format_scaled(gear.stiffness, gear.unit, sd=gear.sd)
         if gear.play is not None and gear.play_sd is not None:
             play = format_scaled(gear.play, gear.play_unit, sd=gear.play_sd)
         late = f"{format_with_sd(1e3 * gear.late_s, 1e3 * gear.late_sd)} ms"
-        rows.append((axis, stiffness, play, gear.explained, late, gear.side))
-    return Table(
+        gears.append((axis, stiffness, play, gear.explained, late, gear.side))
+    yield Table(
         "Gears with an encoder on either side",
         "Axis | >Stiffness ~1.3 | >Play ~1.3 | >Explained :% ~0.8 | >Read late by ~1"
         " | Second encoder ~1",
-        rows,
+        gears,
         "From the difference of the encoders against the load of the drive, less the drive's own"
         " friction and inertia. Explained: share of the variance of the difference that stiffness"
         " and play explain, after timing and the losses of the drive.",
     )
+    loops = results.table("stiffness/loops.parquet")
+    if loops is not None and len(loops):
+        yield _draw_loops(results, axes, loops)
+    yield notes
 
 
 def _draw_loops(results: Results, axes: Mapping[str, AxisStiffness], loops: pd.DataFrame) -> Figure:
     names = [axis for axis in results.order_axes(axes) if (loops["axis"] == axis).any()]
     figure, panels = style.make_grid(len(names), len(names), 2.35, extra=0.0, column_width=2.0)
     for panel, axis in zip(panels, names, strict=True):
-        _draw_loop(results, panel, axis, axes[axis].stiffness, loops[loops["axis"] == axis])
+        rows = loops[loops["axis"] == axis]
+        rows = rows.iloc[style.thin(len(rows), 6000)]
+        deflection, torque = rows["deflection"].to_numpy(), rows["torque"].to_numpy()
+        deflection = deflection - 0.5 * (deflection.min() + deflection.max())
+        factor, unit = choose_scale([float(np.max(np.abs(deflection)))], results.unit(axis))
+        panel.plot(
+            factor * deflection, torque, color=style.FAINT, lw=0.6, label="around a reversal"
+        )
+        away = np.where(rows["post_yield"].to_numpy(dtype=bool), torque, np.nan)
+        panel.plot(factor * deflection, away, color=style.BLUE, lw=0.8, label="away from reversals")
+        middle, reach = 0.5 * (torque.max() + torque.min()), 0.5 * (torque.max() - torque.min())
+        line = np.array([-reach, reach])
+        panel.plot(
+            factor * line / axes[axis].stiffness, middle + line,
+            color=style.VERMILLION, ls=(0, (4, 2)), lw=1.2, label="stiffness",
+        )  # fmt: skip
+        panel.set(title=axis, xlabel=style.label_axis("deflection", unit))
+        panel.set_ylabel(style.label_axis(results.name_force(axis), results.force_unit(axis)))
     caption = (
         f"Hysteresis loops of the locked axes{results.cite_paper('Fig. 3')}: generalised force of "
         "the hand against deflection. The slope of the parts away from reversals (blue) is the "
         "stiffness (dashed)."
     )
     return style.finish(figure, "stiffness-loops", caption, panels[:1])
-
-
-def _draw_loop(
-    results: Results, panel: Any, axis: str, stiffness: float, rows: pd.DataFrame
-) -> None:
-    rows = rows.iloc[style.thin(len(rows), 6000)]
-    deflection, torque = rows["deflection"].to_numpy(), rows["torque"].to_numpy()
-    deflection = deflection - 0.5 * (deflection.min() + deflection.max())
-    factor, unit = choose_scale([float(np.max(np.abs(deflection)))], results.unit(axis))
-    panel.plot(factor * deflection, torque, color=style.FAINT, lw=0.6, label="around a reversal")
-    away = np.where(rows["post_yield"].to_numpy(dtype=bool), torque, np.nan)
-    panel.plot(factor * deflection, away, color=style.BLUE, lw=0.8, label="away from reversals")
-    middle, reach = 0.5 * (torque.max() + torque.min()), 0.5 * (torque.max() - torque.min())
-    line = np.array([-reach, reach])
-    panel.plot(
-        factor * line / stiffness, middle + line,
-        color=style.VERMILLION, ls=(0, (4, 2)), lw=1.2, label="stiffness",
-    )  # fmt: skip
-    panel.set(title=axis, xlabel=style.label_axis("deflection", unit))
-    panel.set_ylabel(style.label_axis(results.name_force(axis), results.force_unit(axis)))

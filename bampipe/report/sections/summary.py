@@ -6,7 +6,7 @@ from typing import Any
 from bampipe.lists import count_noun, join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import verdicts
-from bampipe.report.document import Block, Callout, Paragraph, Table
+from bampipe.report.document import Block, Callout, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
@@ -38,18 +38,6 @@ _TERMS = (
 def list_blocks(results: Results) -> Iterator[Block]:
     """Yield the warnings, the verdict unless the set-up is wrong, and the findings."""
     setup = results.read(SetupResult)
-    yield from _list_warnings(results, setup)
-    if setup is None or not setup.mistakes:
-        yield verdicts.judge_session(results)
-    yield Paragraph(_describe_session(results))
-    if ladder := _describe_ladder(results):
-        yield Paragraph(ladder)
-    if numbers := _tabulate_numbers(results):
-        yield numbers
-
-
-def _list_warnings(results: Results, setup: SetupResult | None) -> Iterator[Callout]:
-    """Yield the mistakes in the set-up, and the outdated results."""
     for mistake in setup.mistakes if setup else ():
         text = f"Once this is corrected, {mistake.evidence}."
         if mistake.alternatives:
@@ -63,6 +51,11 @@ def _list_warnings(results: Results, setup: SetupResult | None) -> Iterator[Call
         steps = ", ".join(f"`{step}`" for step in results.outdated)
         text = f"Run these again before relying on their results: {steps}."
         yield Callout("attention", "Some results are older than their inputs", text)
+    if setup is None or not setup.mistakes:
+        yield verdicts.judge_session(results)
+    yield _describe_session(results)
+    yield _describe_ladder(results)
+    yield _tabulate_numbers(results)
 
 
 def _describe_session(results: Results) -> str:
@@ -126,7 +119,7 @@ def _explain_rejection(compared: CompareResult) -> str:
     )
 
 
-def _tabulate_numbers(results: Results) -> Table | None:
+def _tabulate_numbers(results: Results) -> Table:
     identify, validate = results.read(IdentifyResult), results.read(ValidateResult)
     stiffness = results.read(StiffnessResult)
     identified = identify.parameters if identify else {}
@@ -151,8 +144,6 @@ def _tabulate_numbers(results: Results) -> Table | None:
         for title, cell in cells.items():
             rows.setdefault(title, []).append(cell)
     rows = {title: cells for title, cells in rows.items() if {*cells} != {NONE}}
-    if not rows:
-        return None
     held_out = f"Held-out: {verdicts.describe_held_out(validate)}. {_TERMS}" if validate else ""
     notes = (_name_zeros(results, identified), _list_others(results, identified), held_out)
     return Table(

@@ -8,7 +8,7 @@ from typing import Any
 
 from bampipe.lists import join_names
 from bampipe.phrases import results as phrases
-from bampipe.report.document import Block, Paragraph, Table
+from bampipe.report.document import Block, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     format_decimals,
@@ -32,14 +32,35 @@ _SAME_RATE = 0.02
 def list_blocks(results: Results) -> Iterator[Block]:
     """Yield sampling, trials, and the differentiated motion."""
     notes = results.session.notes.rstrip(".")
-    yield Paragraph(_describe_sampling(results))
-    if notes:
-        yield Paragraph(f"Notes: {notes}.")
+    yield _describe_sampling(results)
+    yield f"Notes: {notes}." if notes else ""
     yield _tabulate_trials(results)
-    if filtered := results.read(FilterResult):
-        yield from _describe_filter(results, filtered)
-    else:
+    filtered = results.read(FilterResult)
+    if filtered is None:
         yield results.state_undone("Velocities and accelerations have not been computed", "filter")
+        return
+    method = phrases.FILTERS.get(filtered.method, filtered.method)
+    yield f"Velocity and acceleration come from {method} ({filtered.method_reason})."
+    skipped = "; ".join(f"{name}: {reason}" for name, reason in filtered.skipped.items())
+    yield f"Not differentiated: {skipped}." if skipped else ""
+    stretches = [
+        (name, f"{one.start_s:.1f} to {one.end_s:.1f}", one.reason)
+        for name, found in filtered.disturbances.items()
+        for one in found
+    ]
+    title = "Stretches that no estimate and no error uses"
+    yield Table(title, "Trial ~1 | Time (s) ~1 | Why ~6", stretches)
+    rows = []
+    for axis, one in results.order_axes(filtered.axes).items():
+        sds = ((one.position_sd, ""), (one.velocity_sd, "/s"), (one.acceleration_sd, "/s2"))
+        shown = (format_scaled(sd, one.unit + per) for sd, per in sds)
+        rows.append((axis, format_scaled(one.resolution, one.unit), one.bandwidth_hz, *shown))
+    yield Table(
+        "Encoders and the motion derived from them: typical standard deviations of error",
+        "Axis | >Resolution ~1 | >Bandwidth (Hz) ~1 | >Position ~1 | >Velocity ~1"
+        " | >Acceleration ~1",
+        rows,
+    )
 
 
 def _describe_sampling(results: Results) -> str:
@@ -117,31 +138,3 @@ def _describe_kind(row: dict[Any, Any]) -> str:
     if kind == "viscous" and damping is not None and math.isfinite(damping):
         return f"viscous, {format_digits(float(damping), 2)} N·s/m"
     return kind
-
-
-def _describe_filter(results: Results, filtered: FilterResult) -> Iterator[Block]:
-    method = phrases.FILTERS.get(filtered.method, filtered.method)
-    yield Paragraph(f"Velocity and acceleration come from {method} ({filtered.method_reason}).")
-    if filtered.skipped:
-        skipped = "; ".join(f"{name}: {reason}" for name, reason in filtered.skipped.items())
-        yield Paragraph(f"Not differentiated: {skipped}.")
-    stretches = [
-        (name, f"{one.start_s:.1f} to {one.end_s:.1f}", one.reason)
-        for name, found in filtered.disturbances.items()
-        for one in found
-    ]
-    if stretches:
-        title = "Stretches that no estimate and no error uses"
-        yield Table(title, "Trial ~1 | Time (s) ~1 | Why ~6", stretches)
-    rows = []
-    for axis, one in results.order_axes(filtered.axes).items():
-        sds = ((one.position_sd, ""), (one.velocity_sd, "/s"), (one.acceleration_sd, "/s2"))
-        shown = (format_scaled(sd, one.unit + per) for sd, per in sds)
-        rows.append((axis, format_scaled(one.resolution, one.unit), one.bandwidth_hz, *shown))
-    if rows:
-        title = "Encoders and the motion derived from them: typical standard deviations of error"
-        columns = (
-            "Axis | >Resolution ~1 | >Bandwidth (Hz) ~1 | >Position ~1 | >Velocity ~1"
-            " | >Acceleration ~1"
-        )
-        yield Table(title, columns, rows)

@@ -1,11 +1,11 @@
 """Trust in the estimates: weak directions, trials, tests of the innovations."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
-from bampipe.report.document import Block, Bullets, Paragraph, Table
+from bampipe.report.document import Block, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_decimals
-from bampipe.results.identify import IdentifiabilityReport, IdentifyResult, InnovationTests
+from bampipe.results.identify import IdentifiabilityReport, IdentifyResult
 
 TITLE = "Trust in the estimates"
 
@@ -16,17 +16,52 @@ def list_blocks(results: Results) -> Iterator[Block]:
     if identified is None:
         return
     if known := identified.identifiability:
-        yield Paragraph(_summarise(identified, known))
-        if known.sentences:
-            yield Bullets(known.sentences)
-        yield _tabulate_bounds(results, identified, known)
+        yield _summarise(identified, known)
+        yield known.sentences
+        rows = []
+        for name in results.order_parameters(known.parameters.keys() - identified.inertial):
+            bound, found = known.parameters[name], identified.parameters[name]
+            partner = None
+            if bound.correlation is not None:
+                partner = f"`{bound.partner}` {format_decimals(bound.correlation, 2)}"
+            sds = (found.sd, bound.bound_sd, bound.alone_sd)
+            rows.append((name, *sds, partner, found.least_squares_bias, found.unit or "1"))
+        yield Table(
+            "Standard deviation of each estimate beside the least possible",
+            "Parameter :code | >SD :2 | >Bound :2 | >Alone :2 | Correlated with"
+            " | >Bias of filtering :2 | Unit :unit",
+            rows,
+            "Bound: Cramér-Rao, the least that sensor noise allows on these trials. Alone: the same"
+            " if all others were known. Correlated with: the parameter whose error is most"
+            " correlated with this one. Bias of filtering: the bias that filtered velocities give"
+            " plain least squares, found from replicates of the fit, and subtracted; the unscented"
+            " filter uses positions alone.",
+        )
         if len(known.trials) > 1:
-            rows = [(name, one.growth, one.parameter) for name, one in known.trials.items()]
+            growth = [(name, one.growth, one.parameter) for name, one in known.trials.items()]
             caption = "Growth of a bound without each trial, for the parameter that needs it most"
-            yield Table(caption, "Trial | >Growth :% | Parameter :code", rows)
-    if identified.innovations:
-        is_published = identified.method == "ukf"
-        yield _tabulate_innovations(results, identified.innovations, is_published)
+            yield Table(caption, "Trial | >Growth :% | Parameter :code", growth)
+    is_published = identified.method == "ukf"
+    rows, outcome = [], {True: "passes", False: "**fails**"}
+    for axis, entry in results.order_axes(identified.innovations or {}).items():
+        own, inputs = entry.whiteness, entry.inputs
+        white = (outcome[own.white], own.share) if own else (None, None)
+        driven = (outcome[inputs.independent], inputs.share) if inputs else (None, None)
+        rows.append((axis, *white, *driven, entry.sentence if is_published else ""))
+    note = (
+        "White: Ljung-Box over one second. Inputs: regression on the inputs up to half a second "
+        "back. Share: of the variance that is predictable beyond chance."
+    )
+    if not is_published:
+        note += (
+            " The parameters of the filter are not those published: a failure may be due to them."
+        )
+    yield Table(
+        "Innovations of the filter",
+        "Axis | White | >Share :% | Inputs | >Share :% | In words ~1",
+        rows,
+        note,
+    ).drop_empty_columns()
 
 
 def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
@@ -46,57 +81,3 @@ def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
             f"`models/{identified.model}/identify.json` lists them."
         )
     return words
-
-
-def _tabulate_bounds(
-    results: Results, identified: IdentifyResult, known: IdentifiabilityReport
-) -> Table:
-    rows = []
-    for name in results.order_parameters(known.parameters.keys() - identified.inertial):
-        bound, found = known.parameters[name], identified.parameters[name]
-        partner = None
-        if bound.correlation is not None:
-            partner = f"`{bound.partner}` {format_decimals(bound.correlation, 2)}"
-        sds = (found.sd, bound.bound_sd, bound.alone_sd)
-        rows.append((name, *sds, partner, found.least_squares_bias, found.unit or "1"))
-    return Table(
-        "Standard deviation of each estimate beside the least possible",
-        "Parameter :code | >SD :2 | >Bound :2 | >Alone :2 | Correlated with"
-        " | >Bias of filtering :2 | Unit :unit",
-        rows,
-        "Bound: Cramér-Rao, the least that sensor noise allows on these trials. Alone: the same"
-        " if all others were known. Correlated with: the parameter whose error is most"
-        " correlated with this one. Bias of filtering: the bias that filtered velocities give"
-        " plain least squares, found from replicates of the fit, and subtracted; the unscented"
-        " filter uses positions alone.",
-    )
-
-
-def _tabulate_innovations(
-    results: Results, tests: Mapping[str, InnovationTests], is_published: bool
-) -> Table:
-    """Tabulate the tests, in words only where the filter's parameters are those published."""
-    rows = []
-    for axis, entry in results.order_axes(tests).items():
-        own, inputs = entry.whiteness, entry.inputs
-        white = (_tell_outcome(own.white), own.share) if own else (None, None)
-        driven = (_tell_outcome(inputs.independent), inputs.share) if inputs else (None, None)
-        rows.append((axis, *white, *driven, entry.sentence if is_published else ""))
-    note = (
-        "White: Ljung-Box over one second. Inputs: regression on the inputs up to half a second "
-        "back. Share: of the variance that is predictable beyond chance."
-    )
-    if not is_published:
-        note += (
-            " The parameters of the filter are not those published: a failure may be due to them."
-        )
-    return Table(
-        "Innovations of the filter",
-        "Axis | White | >Share :% | Inputs | >Share :% | In words ~1",
-        rows,
-        note,
-    ).drop_empty_columns()
-
-
-def _tell_outcome(passed: bool) -> str:
-    return "passes" if passed else "**fails**"

@@ -1,14 +1,13 @@
 """Validation: measured and predicted force (Fig. 9), error without friction (Fig. 4), tables."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from bampipe.lists import join_names
 from bampipe.report import style, verdicts
-from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
@@ -32,28 +31,6 @@ def list_blocks(results: Results) -> Iterator[Block]:
         said = "The predicted force has not been compared with the measured one"
         yield results.state_undone(said, "validate")
         return
-    yield _tabulate_axes(results, validated)
-    if validated.trials:
-        yield _tabulate_trials(results, validated)
-    if validated.forces:
-        shown = join_names(
-            f"{split_name(name)} {format_digits(one.rmse)} {format_unit(one.unit)}"
-            for name, one in validated.forces.items()
-        )
-        place = " at the handle" if results.pusher == "hand" else ""
-        yield Paragraph(f"Error of the predicted force{place} (RMSE): {shown}.")
-    if validated.free_run is not None and validated.free_run.drift:
-        yield from _tabulate_drift(results, validated, validated.free_run.drift)
-    if validated.notes:
-        yield Bullets(validated.notes)
-    residuals = _read_trial(results)
-    if residuals is not None:
-        yield _draw_forces(results, residuals)
-        if velocity := _read_velocity(results, residuals):
-            yield _draw_friction(results, residuals, velocity)
-
-
-def _tabulate_axes(results: Results, validated: ValidateResult) -> Table:
     rows = []
     for axis, one in results.order_axes(validated.axes).items():
         fit = None if one.fit_percent is None else format_decimals(one.fit_percent, 1)
@@ -62,7 +39,7 @@ def _tabulate_axes(results: Results, validated: ValidateResult) -> Table:
     bands = {axis: f"at {format_digits(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()}
     different = {*bands.values()}
     each = join_names(map(" ".join, bands.items())) if len(different) != 1 else different.pop()
-    return Table(
+    yield Table(
         f"Error of the predicted force, model `{validated.model}`",
         "Axis | >Held-out RMSE ~1 | >Noise floor ~1 | >RMSE, all trials ~1"
         " | >RMSE without friction ~1.2 | >Fit (%) ~0.6 | Unit :unit",
@@ -72,18 +49,30 @@ def _tabulate_axes(results: Results, validated: ValidateResult) -> Table:
         "that is explained, as 100 (1 − held-out RMSE / standard deviation). Both forces are "
         f"low-passed {each}.",
     )
-
-
-def _tabulate_trials(results: Results, validated: ValidateResult) -> Table:
-    rows = []
+    trials = []
     for name, trial in validated.trials.items():
         key = "held_out_rmse" if trial.held_out else "rmse"
         # Zero: the axis rested, no sample counts.
-        errors = (getattr(trial.axes.get(axis), key, None) or None for axis in results.axes)
-        rows.append((name, trial.held_out, *errors))
+        by_axis = (getattr(trial.axes.get(axis), key, None) or None for axis in results.axes)
+        trials.append((name, trial.held_out, *by_axis))
     heads = (f">{axis} ({format_unit(results.force_unit(axis))})" for axis in results.axes)
-    note = "–: the axis rested." if any(None in row for row in rows) else ""
-    return Table("RMSE by trial", " | ".join(("Trial | Held out", *heads)), rows, note)
+    note = "–: the axis rested." if any(None in row for row in trials) else ""
+    yield Table("RMSE by trial", " | ".join(("Trial | Held out", *heads)), trials, note)
+    if validated.forces:
+        shown = join_names(
+            f"{split_name(name)} {format_digits(one.rmse)} {format_unit(one.unit)}"
+            for name, one in validated.forces.items()
+        )
+        place = " at the handle" if results.pusher == "hand" else ""
+        yield f"Error of the predicted force{place} (RMSE): {shown}."
+    if validated.free_run is not None and validated.free_run.drift:
+        yield from _tabulate_drift(results, validated, validated.free_run.drift)
+    yield validated.notes
+    residuals = _read_trial(results)
+    if residuals is not None:
+        yield _draw_forces(results, residuals)
+        if velocity := _read_velocity(results, residuals):
+            yield _draw_friction(results, residuals, velocity)
 
 
 def _tabulate_drift(
@@ -94,7 +83,7 @@ def _tabulate_drift(
     horizons = sorted({h.horizon_s for one in axes.values() for h in one.horizons})
     reasons = {axis: one.reason for axis, one in axes.items() if one.reason}
     if not horizons and len(reasons) == len(axes) and len(set(reasons.values())) == 1:
-        yield Paragraph(f"No short free runs of this model. {next(iter(reasons.values()))}")
+        yield f"No short free runs of this model. {next(iter(reasons.values()))}"
         return
     if horizons:
         rows = []
@@ -118,9 +107,7 @@ def _tabulate_drift(
         )
         columns = " | ".join(("Axis", *heads, "Unit"))
         yield Table("Drift of the model in free runs", columns, rows, note)
-    if reasons:
-        lines = (f"{axis}: {why[:1].lower()}{why[1:]}" for axis, why in reasons.items())
-        yield Bullets(tuple(lines))
+    yield tuple(f"{axis}: {why[:1].lower()}{why[1:]}" for axis, why in reasons.items())
 
 
 def _read_trial(results: Results) -> pd.DataFrame | None:
@@ -203,7 +190,25 @@ def _draw_friction(
     for column, axis in enumerate(axes):
         top, bottom = panels[0, column], panels[1, column]
         kind, unit = results.name_force(axis), results.force_unit(axis)
-        _draw_movement(top, bottom, frame, axis, velocity[axis])
+        t, measured = frame["t"].to_numpy(), frame[f"torque_measured_{axis}"].to_numpy()
+        without = frame[f"torque_predicted_without_friction_{axis}"].to_numpy()
+        error = measured - without
+        one, keep = _find_movement(velocity[axis]), style.thin(len(error), 2500)
+        speed = velocity[axis]
+        top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5)
+        top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
+        count = len(speed[one])
+        if count >= 12:
+            start, ahead = count // 5, count // 5 + max(2, count // 25)
+            tail, head = ((speed[one][k], error[one][k]) for k in (start, ahead))
+            look = {"arrowstyle": "-|>", "color": style.VERMILLION, "mutation_scale": 13}
+            top.annotate("", xy=head, xytext=tail, arrowprops=look)
+        style.set_limits(top, [np.quantile(error, [0.001, 0.999]), error[one]])
+        shown = t[one] - t[one][0]
+        bottom.plot(shown, measured[one], color=style.INK, lw=1.4, label="measured")
+        bottom.plot(shown, without[one], color=style.ORANGE, ls=(0, (4, 1.5)), lw=1.1,
+                    label="predicted without friction")  # fmt: skip
+        bottom.axhline(0.0, color=style.INK, lw=0.5)
         top.set_title(style.break_heading(axis, len(axes)))
         top.set_xlabel(style.label_axis("velocity", results.rate_unit(axis)))
         bottom.set_xlabel("time (s)")
@@ -219,27 +224,3 @@ def _draw_friction(
         f"of one movement. {places[1]}: that movement."
     )
     return style.finish(figure, "error-without-friction", caption, [panels[0, 0], panels[1, 0]])
-
-
-def _draw_movement(
-    top: Any, bottom: Any, frame: pd.DataFrame, axis: str, speed: np.ndarray
-) -> None:
-    """Draw the error of a model without friction over speed, and below one movement over time."""
-    t, measured = frame["t"].to_numpy(), frame[f"torque_measured_{axis}"].to_numpy()
-    without = frame[f"torque_predicted_without_friction_{axis}"].to_numpy()
-    error = measured - without
-    one, keep = _find_movement(speed), style.thin(len(error), 2500)
-    top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5)
-    top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
-    count = len(speed[one])
-    if count >= 12:
-        start, ahead = count // 5, count // 5 + max(2, count // 25)
-        tail, head = ((speed[one][k], error[one][k]) for k in (start, ahead))
-        look = {"arrowstyle": "-|>", "color": style.VERMILLION, "mutation_scale": 13}
-        top.annotate("", xy=head, xytext=tail, arrowprops=look)
-    style.set_limits(top, [np.quantile(error, [0.001, 0.999]), error[one]])
-    shown = t[one] - t[one][0]
-    bottom.plot(shown, measured[one], color=style.INK, lw=1.4, label="measured")
-    bottom.plot(shown, without[one], color=style.ORANGE, ls=(0, (4, 1.5)), lw=1.1,
-                label="predicted without friction")  # fmt: skip
-    bottom.axhline(0.0, color=style.INK, lw=0.5)

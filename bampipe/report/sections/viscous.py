@@ -7,7 +7,7 @@ import pandas as pd
 
 from bampipe.lists import join_names
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Paragraph, Table
+from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.viscous import Damping, ViscousResult
@@ -22,8 +22,19 @@ def list_blocks(results: Results) -> Iterator[Block]:
         yield results.state_undone("The viscous trials have not been used", "viscous")
     if found is None or not found.directions:
         return
-    yield Paragraph(_compare(found.directions))
-    yield _tabulate(found.directions)
+    yield _compare(found.directions)
+    yield Table(
+        "Damping at the handle (N·s/m), along the components of its force",
+        "Direction | >Commanded | >Rendered by the brakes | >p :p | >Own friction"
+        " | >Felt by a hand",
+        [
+            (name, d.commanded, (d.estimate, d.sd), d.p_value, d.own_friction, d.felt)
+            for name, d in found.directions.items()
+        ],
+        "± one standard deviation over blocks of time. p: probability of so large a difference "
+        "from the command if there were none (two-sided, Student's t). Friction and inertia as "
+        "identified; the filter does not use the commands of the brakes.",
+    )
     trace = results.table(results.model_file("viscous.parquet"))
     if trace is not None and len(trace):
         yield _draw(results, found.directions, trace)
@@ -45,21 +56,6 @@ def _compare(directions: Mapping[str, Damping]) -> str:
     if any(one.felt_differs for one in tested.values()):
         parts.append("A hand feels more: the device's own viscous friction adds to the field.")
     return " ".join(parts)
-
-
-def _tabulate(directions: Mapping[str, Damping]) -> Table:
-    return Table(
-        "Damping at the handle (N·s/m), along the components of its force",
-        "Direction | >Commanded | >Rendered by the brakes | >p :p | >Own friction"
-        " | >Felt by a hand",
-        [
-            (name, d.commanded, (d.estimate, d.sd), d.p_value, d.own_friction, d.felt)
-            for name, d in directions.items()
-        ],
-        "± one standard deviation over blocks of time. p: probability of so large a difference "
-        "from the command if there were none (two-sided, Student's t). Friction and inertia as "
-        "identified; the filter does not use the commands of the brakes.",
-    )
 
 
 def _draw(results: Results, directions: Mapping[str, Damping], trace: pd.DataFrame) -> Figure:

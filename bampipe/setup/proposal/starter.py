@@ -119,7 +119,7 @@ def weight_of(
         return None, ""
     moments = fit.pose.moments if fit.pose is not None else (0.0, 0.0)
     size = max(*map(abs, moments), fit.coulomb, _LEAST_WEIGHT) * (_USUAL_GEAR if geared else 1.0)
-    doubt = "assumed, as of any joint: the motion does not show it"
+    doubt = "assumed, as for any joint: the motion does not show it"
     return Weight((0.0, 0.0), size, doubt), f"gravity is {doubt}"
 
 

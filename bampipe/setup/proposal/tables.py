@@ -359,27 +359,23 @@ def input_tables(
     forces = [column for name in device.forces if (column := given[name][0]) is not None]
     if sensed and len(forces) in (0, len(device.forces)):
         match.used |= {column.name for column in forces}
-        lines += _force_table(device, forces, given[device.forces[0]][1], notes)
+        names = [column.name for column in forces] or [UNKNOWN] * len(device.forces)
+        ask = "" if forces else notes.ask_column(" and ".join(device.forces), device.force_unit)
+        unit_of = [f'unit = "{device.force_unit}"']
+        if forces:
+            unit_of = _force_unit(device, forces, given[device.forces[0]][1], notes)
+        lines += [
+            "[force]",
+            f"columns = [{', '.join(map(quoted, names))}]{ask}",
+            f"components = [{', '.join(map(quoted, device.components))}]",
+            *unit_of,
+            "",
+        ]
         if match.reacting in {column.name for column in forces}:
             lines.insert(-1, "reaction = true" + notes.guess(f"{match.reacting} is the reaction"))
         wanted = dict(device.channels)
     lines += _brakes_table(device, match, notes)
     return lines + _channels_table(wanted, given, match, notes)
-
-
-def _force_table(
-    device: Device, columns: list[SurveyedColumn], why: str, notes: Notes
-) -> list[str]:
-    names = [column.name for column in columns] or [UNKNOWN] * len(device.forces)
-    ask = "" if columns else notes.ask_column(" and ".join(device.forces), device.force_unit)
-    stated = [f'unit = "{device.force_unit}"']
-    return [
-        "[force]",
-        f"columns = [{', '.join(map(quoted, names))}]{ask}",
-        f"components = [{', '.join(map(quoted, device.components))}]",
-        *(_force_unit(device, columns, why, notes) if columns else stated),
-        "",
-    ]
 
 
 def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: Notes) -> list[str]:
