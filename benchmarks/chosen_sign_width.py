@@ -24,7 +24,7 @@ from independent.sensors import GOOD, HARD, Conditions
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import load_model, read_recipe
+from bampipe.declarations.model_file import load_model, read_spec
 from bampipe.diagnosis.session import system_of
 from bampipe.diagnosis.start import fit_width
 from bampipe.trials.measured import read_measured_trials
@@ -48,13 +48,13 @@ def find_drops(machine: str, seed: int, effect: str, conditions: Conditions) -> 
         pipeline = str(root / "widths.toml")
         session = bampipe.run_session(root / "session", runs=root / "runs", pipeline=pipeline)
         run = RunFolder(Path(session.root))
-        recipe = read_recipe(run, "base", load_model(run, "base", as_declared=True))
-        trials = read_measured_trials(run, system_of(recipe), every_input=True)
-        declared = fit_width(trials, recipe, 1.0)
+        spec = read_spec(run, "base", load_model(run, "base", as_declared=True))
+        trials = read_measured_trials(run, system_of(spec), every_input=True)
+        declared = fit_width(trials, spec, 1.0)
         count, error = declared.problem.independent, declared.held_out_rmse
         return [
             float(count @ np.log(error / one.held_out_rmse) / count.sum())
-            for one in (fit_width(trials, recipe, width) for width in WIDTHS)
+            for one in (fit_width(trials, spec, width) for width in WIDTHS)
         ]
 
 

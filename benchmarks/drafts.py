@@ -37,7 +37,7 @@ from bampipe.diagnosis.session import Session
 from bampipe.physics import compile_model
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
-from bampipe.trials.evidence import gather_evidence
+from bampipe.trials.linearisation import linearise_fit
 from bampipe.trials.measured import read_measured_trials
 
 CASES = (
@@ -219,14 +219,14 @@ def curve_error(run: RunFolder, model: str, axis: str, effect: str, truth: dict[
     p = read_estimate(run, model, system)
     bare = compile_model(load_model(run, "base"))
     trials = read_measured_trials(run, bare, every_input=True)
-    evidence = gather_evidence(
+    linearisation = linearise_fit(
         bare, trials.motions, trials.band, read_estimate(run, "base", bare), trials.folds
     )
     number = bare.coordinates.index(axis)
     width = bare.model.device.coordinates[number].sign_width
     wanted, given, slopes = [], [], []
     for k, motion in enumerate(trials.motions):
-        used = evidence.used[k][:, number]
+        used = linearisation.used[k][:, number]
         step, rate = float(np.median(np.diff(motion.t))), motion.qd[:, number]
         u = motion.inputs(system.inputs)
         if name in FORCES:
@@ -243,7 +243,7 @@ def curve_error(run: RunFolder, model: str, axis: str, effect: str, truth: dict[
         both = trials.band.thin(np.column_stack([force, added]), [number, number])[used]
         wanted.append(both[:, 0])
         given.append(both[:, 1])
-        slopes.append(evidence.jacobian[k][used, number])
+        slopes.append(linearisation.jacobian[k][used, number])
     columns = np.concatenate(slopes)
     columns = columns[:, np.any(columns != 0.0, axis=0)]
 

@@ -14,7 +14,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.diagnosis.session import system_of
 from bampipe.physics import registry
 from bampipe.physics.device import Device
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.progress import silent
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import ingest
@@ -65,7 +65,7 @@ def device_of(machine: str) -> Device:
 
 def record_trials(
     root: Path, machine: str, seed: int, *effects: str, **conditions: Any
-) -> tuple[MeasuredTrials, Recipe, dict[str, float]]:
+) -> tuple[MeasuredTrials, ModelSpec, dict[str, float]]:
     """Record a session with ``effects`` hidden and filter it.
 
     Returns its trials, the bare device, and the true values of a right model.
@@ -79,9 +79,9 @@ def record_trials(
         run.path(stage).mkdir(parents=True)
     ingest.execute(run, run.root, ingest.Config(session=str(root / machine)), silent)
     filter_stage.execute(run, run.root, filter_stage.Config(), silent)
-    recipe = Recipe(device_of(machine).declaration, (), ())
-    trials = read_measured_trials(run, system_of(recipe), every_input=True)
-    return trials, recipe, truth["parameters"]
+    spec = ModelSpec(device_of(machine).declaration, (), ())
+    trials = read_measured_trials(run, system_of(spec), every_input=True)
+    return trials, spec, truth["parameters"]
 
 
 def diagnose(run: bampipe.Run) -> dict[str, Any]:

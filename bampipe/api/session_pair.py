@@ -38,7 +38,7 @@ from bampipe.results.pair import (
 )
 from bampipe.results.validate import ValidateResult
 from bampipe.run import models
-from bampipe.trials.evidence import Evidence, gather_evidence
+from bampipe.trials.linearisation import Linearisation, linearise_fit
 from bampipe.trials.measured import read_measured_trials
 
 _MAPPED_VARIABLES = ("position", "velocity", "direction")
@@ -73,17 +73,17 @@ class _Side:
     def effects(self) -> tuple[str, ...]:
         return tuple(effect.name for effect in self.system.model.effects)
 
-    def predict(self, other: _Side) -> Evidence:
+    def predict(self, other: _Side) -> Linearisation:
         """Evaluate this model on the trials of ``other`` without a refit."""
         trials = read_measured_trials(other.run, self.system, timing=other.found.input_timing)
-        return gather_evidence(
+        return linearise_fit(
             self.system, trials.motions, trials.band, self.p, trials.folds, most_iterations=0
         )
 
-    def covariance(self, evidence: Evidence) -> Array:
+    def covariance(self, linearisation: Linearisation) -> Array:
         """Return the covariance of the free parameters, (n, n); 0 if they were not estimated."""
         known = self.found.covariance
-        free = [self.system.parameters[i].name for i in evidence.free]
+        free = [self.system.parameters[i].name for i in linearisation.free]
         frame = pd.DataFrame(known.matrix, list(known.names), list(known.names))
         return np.asarray(frame.reindex(index=free, columns=free, fill_value=0.0))
 
@@ -115,9 +115,9 @@ def compare_runs(
     progress(0.1, f"predicting {b.name} with the model of {a.name}, and the reverse")
     there, back = a.predict(b), b.predict(a)
     journeys = []
-    for one, other, evidence in ((a, b, there), (b, a, back)):
+    for one, other, linearisation in ((a, b, there), (b, a, back)):
         progress(0.3, f"looking for effects that the model of {one.name} lacks on {other.name}")
-        journeys.append(_describe_journey(one, other, evidence))
+        journeys.append(_describe_journey(one, other, linearisation))
     progress(0.9, "comparing the residuals by state")
     tables: list[dict[str, ParameterEstimate | BaseEstimate]] = []
     for found in (a.found, b.found):
@@ -196,7 +196,7 @@ def correct_p_values(z: Sequence[float]) -> list[float]:
     return [float(value) for value in np.minimum(found, 1.0)]
 
 
-def _compare_states(a: _Side, here: Evidence, there: Evidence) -> tuple[StateChange, ...]:
+def _compare_states(a: _Side, here: Linearisation, there: Linearisation) -> tuple[StateChange, ...]:
     """Return the residual of the model of ``a`` on both sessions, in equal bins of the state."""
     spread, found, every = a.covariance(here), [], []
     for axis, name in enumerate(a.system.coordinates):
@@ -227,7 +227,7 @@ def _compare_states(a: _Side, here: Evidence, there: Evidence) -> tuple[StateCha
     )  # fmt: skip
 
 
-def _bin_residual(e: Evidence, axis: int, values: Array, edges: Array) -> pd.DataFrame:
+def _bin_residual(e: Linearisation, axis: int, values: Array, edges: Array) -> pd.DataFrame:
     """Return centre, mean residual, its standard error, count and mean slopes of each bin.
 
     The standard error is the larger of those within and between trials.
@@ -256,7 +256,7 @@ def _make_map(bins: pd.DataFrame, unit: str) -> ResidualMap:
     return ResidualMap.of(unit=unit, count=bins["count"], variance_share=0.0, **columns)
 
 
-def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
+def _describe_journey(model: _Side, trials: _Side, e: Linearisation) -> Journey:
     """Predict the trials of one session with the model of the other, and refit it if it fails."""
     judged = list(np.flatnonzero(e.folds.judged))
     count = np.maximum(e.sums.count[judged].sum(axis=0), 1.0)
@@ -292,7 +292,7 @@ def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
     return journey.model_copy(update=update)
 
 
-def _refit_together(e: Evidence, limits: Array) -> Refit | None:
+def _refit_together(e: Linearisation, limits: Array) -> Refit | None:
     """Refit parameters, one more at a time while an axis comes closer to its limit."""
     chosen: list[int] = []
     error = e.rmse()
@@ -312,7 +312,7 @@ def _sum_excess(error: Array, limits: Array) -> float:
     return float(np.sum(np.log(np.maximum(error / limits, 1.0))))
 
 
-def _refit(e: Evidence, chosen: list[int], limits: Array) -> Refit:
+def _refit(e: Linearisation, chosen: list[int], limits: Array) -> Refit:
     """Refit the free parameters with indices ``chosen`` and hold the others."""
     start, free = e.p, list(e.free)
     step, error = _solve(e, chosen, limits)
@@ -320,7 +320,7 @@ def _refit(e: Evidence, chosen: list[int], limits: Array) -> Refit:
         for _ in range(_REFIT_STEPS):
             p = e.p.copy()
             p[[free[k] for k in chosen]] += step
-            e = gather_evidence(e.system, e.motions, e.band, p, e.folds, most_iterations=0)
+            e = linearise_fit(e.system, e.motions, e.band, p, e.folds, most_iterations=0)
             step, error = _solve(e, chosen, limits)
     names = [e.system.parameters[free[k]].name for k in chosen]
     change = e.p[[free[k] for k in chosen]] + step - start[[free[k] for k in chosen]]
@@ -333,7 +333,7 @@ def _refit(e: Evidence, chosen: list[int], limits: Array) -> Refit:
     )
 
 
-def _solve(e: Evidence, chosen: list[int], limits: Array) -> tuple[Array, Array]:
+def _solve(e: Linearisation, chosen: list[int], limits: Array) -> tuple[Array, Array]:
     """Return a linear step of some free parameters, and its held-out error, (n_q,)."""
     sums, groups = e.sums, np.array(e.folds.groups)
     fitted, judged = np.array(e.folds.fitted), np.array(e.folds.judged)

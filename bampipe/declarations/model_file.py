@@ -9,7 +9,7 @@ from bampipe.errors import InputError
 from bampipe.files import read_toml
 from bampipe.physics import Model, System, registry
 from bampipe.physics.device import Device
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.identify import IdentifyResult
 
 MODEL_INPUTS = ("models/{model}/model.toml", "models/{model}/effects/*.toml", "ingest/device.toml?")
@@ -39,7 +39,7 @@ def load_model(run: RunFolder, name: str, *, as_declared: bool = False) -> Model
     factor = run.read(IdentifyResult, name).sign_width_factor
     if factor == 1.0:
         return declared
-    return read_recipe(run, name, declared).with_sign_widths(factor).model()
+    return read_spec(run, name, declared).with_sign_widths(factor).model()
 
 
 def load_device(run: RunFolder, name: str) -> Device:
@@ -54,10 +54,10 @@ def load_device(run: RunFolder, name: str) -> Device:
     return registry.device(name)
 
 
-def read_recipe(run: RunFolder, name: str, model: Model) -> Recipe:
+def read_spec(run: RunFolder, name: str, model: Model) -> ModelSpec:
     """Return ``model``, called ``name`` in the run folder, as plain data for worker processes."""
     own = [read_toml(run.path(path)) for path in run.glob(f"models/{name}/effects/*.toml")]
-    return Recipe(model.device.declaration, tuple(e.name for e in model.effects), tuple(own))
+    return ModelSpec(model.device.declaration, tuple(e.name for e in model.effects), tuple(own))
 
 
 def read_estimate(run: RunFolder, name: str, system: System) -> NDArray[np.float64]:

@@ -6,18 +6,18 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
-from bampipe.trials.evidence import Evidence
 from bampipe.trials.linear_problem import NOTHING
+from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.residuals import ModelOnTrial
 
 
-def compute_columns(evidence: Evidence, item: Candidate, searched: Array) -> Array:
+def compute_columns(linearisation: Linearisation, item: Candidate, searched: Array) -> Array:
     """Return the low-passed change of the residual by each linear strength, (n, n_q, m).
 
     The rows are those of all trials. A candidate without a linear strength has one column, its
     whole change of the residual. ``searched`` are the values of its searched parameters.
     """
-    e, system = evidence, item.system
+    e, system = linearisation, item.system
     count, p = len(system.parameters) - len(item.parameters), make_parameters(e, item, searched)
     axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
     probes = [p.copy() for _ in item.linear_indices or (None,)]
@@ -37,10 +37,10 @@ def compute_columns(evidence: Evidence, item: Candidate, searched: Array) -> Arr
 
 
 def make_parameters(
-    evidence: Evidence, item: Candidate, searched: Array, strengths: Array | float = 0.0
+    linearisation: Linearisation, item: Candidate, searched: Array, strengths: Array | float = 0.0
 ) -> Array:
     """Return the parameters of a candidate's system, the model's own as fitted, (n_p,)."""
-    e, system = evidence, item.system
+    e, system = linearisation, item.system
     count = len(system.parameters) - len(item.parameters)
     p = np.array([q.prior for q in system.parameters])
     beside_others = item.is_joint or _moves(item)

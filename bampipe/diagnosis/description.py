@@ -9,7 +9,7 @@ from scipy.stats import gamma
 from bampipe.arrays import Array
 from bampipe.diagnosis.shape import BINS, Map, Variable, number_bins, residual_map, variables
 from bampipe.results.rounding import significant
-from bampipe.trials.evidence import Evidence
+from bampipe.trials.linearisation import Linearisation
 
 _VARIABLE, _MENTIONED = 0.2, 0.005
 """Smallest share of a residual's variance that a variable must explain to name its shape, and to be
@@ -35,16 +35,16 @@ class _Sine:
     frequency: float
 
 
-def describe(evidence: Evidence, axis: int) -> str:
+def describe(linearisation: Linearisation, axis: int) -> str:
     """Return the shape of an axis' residual, by the variable that explains most of it."""
-    every = variables(evidence.fitted, evidence.band, axis)
+    every = variables(linearisation.fitted, linearisation.band, axis)
     known = [v for v in every if v.name not in ("trial", "direction")]
-    maps = [residual_map(evidence, axis, v, 3 * BINS) for v in known]
+    maps = [residual_map(linearisation, axis, v, 3 * BINS) for v in known]
     best = int(np.argmax([m.share for m in maps]))
     most, variable = maps[best], known[best]
-    unit = evidence.system.torque_units[axis]
+    unit = linearisation.system.torque_units[axis]
     if most.share < _VARIABLE or most.variable == "time":
-        vibration = _vibration(evidence, axis)
+        vibration = _vibration(linearisation, axis)
         if vibration is not None and vibration.share > max(most.share, _VARIABLE):
             return (
                 f"a vibration of {significant(vibration.amplitude, 2)} {unit} at "
@@ -59,8 +59,8 @@ def describe(evidence: Evidence, axis: int) -> str:
             else "scattered over all motions and independent of all variables of the motion"
         )
     explains = f"{most.variable} explains {100 * most.share:.0f} % of the residual's variance"
-    turning = _by_direction(evidence, axis, variable)
-    ripple = _ripple(evidence, axis, variable)
+    turning = _by_direction(linearisation, axis, variable)
+    ripple = _ripple(linearisation, axis, variable)
     if ripple is not None and ripple.share > _RIPPLE * most.share:
         period = 1.0 / ripple.frequency
         return (
@@ -90,10 +90,10 @@ def _bumps(most: Map, torque_unit: str) -> str:
     return f"{form} {' and '.join(words for _, words in places)} (between {between})"
 
 
-def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
+def _ripple(linearisation: Linearisation, axis: int, variable: Variable) -> _Sine | None:
     """Return the best sine along ``variable`` with at least two periods within its range."""
-    use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
-    r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
+    use = np.concatenate([u[:, axis] for u in linearisation.used]) > 0
+    r = np.concatenate([x[:, axis] for x in linearisation.residual])[use]
     v = np.concatenate(variable.values)[use]
     low, high = np.quantile(v, [0.01, 0.99])
     if high <= low:
@@ -101,18 +101,18 @@ def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
     return _best_sine([(v, r)], np.arange(2.0, BINS, 0.1) / (high - low))
 
 
-def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
+def _vibration(linearisation: Linearisation, axis: int) -> _Sine | None:
     """Return the best sine in time, or None if chance could give one as strong.
 
     The share of noise at one frequency is a sum of one exponential variate per trial (Lomb 1976).
     """
-    band = evidence.band
+    band = linearisation.band
     trials = []
-    for k, motion in enumerate(evidence.motions):
-        use = evidence.used[k][:, axis] > 0
+    for k, motion in enumerate(linearisation.motions):
+        use = linearisation.used[k][:, axis] > 0
         if use.sum() > 2 * BINS:
             t = motion.t[band.thinned_rows(len(motion.t))][use]
-            trials.append((t, evidence.residual[k][use, axis]))
+            trials.append((t, linearisation.residual[k][use, axis]))
     if not trials:
         return None
     longest = max(float(np.ptp(t)) for t, _ in trials)
@@ -146,12 +146,12 @@ def _best_sine(trials: Sequence[tuple[Array, Array]], frequencies: Array) -> _Si
     return best
 
 
-def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
+def _by_direction(linearisation: Linearisation, axis: int, variable: Variable) -> str:
     """Compare the residual in both directions of motion, in words."""
-    r = np.concatenate([x[:, axis] for x in evidence.residual])
+    r = np.concatenate([x[:, axis] for x in linearisation.residual])
     v = np.concatenate(variable.values)
-    kept = [evidence.band.thinned_rows(len(m.t)) for m in evidence.motions]
-    rate = np.concatenate([m.qd[k, axis] for m, k in zip(evidence.motions, kept, strict=True)])
+    kept = [linearisation.band.thinned_rows(len(m.t)) for m in linearisation.motions]
+    rate = np.concatenate([m.qd[k, axis] for m, k in zip(linearisation.motions, kept, strict=True)])
     which = number_bins(v, 3 * BINS)
     means = []
     for b in np.unique(which):

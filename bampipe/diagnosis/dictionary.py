@@ -12,7 +12,7 @@ from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import compute_columns, make_parameters
 from bampipe.diagnosis.ranges import MachineScale, SearchRange
-from bampipe.trials.evidence import Evidence
+from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.samples import Samples, take_samples
 from bampipe.trials.scale import NO_SLOPE, Spectra, gain_of_filter, slopes_by_force
 
@@ -57,7 +57,7 @@ class Atom:
 class Dictionary:
     """The candidates of one fitted model by name, and the samples of the model that count."""
 
-    evidence: Evidence
+    linearisation: Linearisation
     samples: Sequence[Samples]
     candidates: Mapping[str, Candidate]
     scale: MachineScale
@@ -114,7 +114,7 @@ class Dictionary:
 
     def make(self, key: Key) -> Atom | None:
         """Compute a candidate at one shape; None if it has no effect in these trials."""
-        e, item, values = self.evidence, self.candidates[key[0]], self.values(key)
+        e, item, values = self.linearisation, self.candidates[key[0]], self.values(key)
         with np.errstate(all="ignore"):
             columns = compute_columns(e, item, values)
         found = {}
@@ -132,7 +132,7 @@ class Dictionary:
 
     def _slopes(self, item: Candidate, probes: Sequence[Array]) -> dict[int, Array]:
         """Return `Atom.slopes` at the m ``probes``, (n_p,) each, which share internal states."""
-        e, system = self.evidence, item.system
+        e, system = self.linearisation, item.system
         if not (system.driven or system.force_fed):
             return {}
         rows = slopes_by_force(system, e.joined, e.band, probes)
@@ -149,13 +149,13 @@ class Dictionary:
         """Return `Atom.gain`; a candidate with ``slopes`` is no filter."""
         if slopes or item.linear_indices or not item.system.force_fed:
             return np.ones(len(self.samples))
-        e = self.evidence
+        e = self.linearisation
         return gain_of_filter(self._spectra, e.spectra_of(item.system, p), e.band)
 
     @cached_property
     def _spectra(self) -> Spectra:
         """Spectra of the force that the model applies."""
-        return self.evidence.spectra_of(self.evidence.system, self.evidence.p)
+        return self.linearisation.spectra_of(self.linearisation.system, self.linearisation.p)
 
     def scale_without(
         self, name: str, absence: Mapping[int, float]
@@ -164,7 +164,7 @@ class Dictionary:
 
         ``absence`` is the change of each free parameter that removes it.
         """
-        e, unchanged = self.evidence, np.ones(len(self.samples))
+        e, unchanged = self.linearisation, np.ones(len(self.samples))
         moved = {e.free[place]: change for place, change in absence.items() if change}
         if not (e.system.parameters_by_force & moved.keys()):
             return {}, unchanged

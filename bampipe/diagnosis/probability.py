@@ -87,7 +87,7 @@ def weigh_sets(
     pool = {n: (costs.cost(k) + shortfall[k], k) for n, (_, k) in pool.items()}
     none = costs.cost(())
     own = [e for e in costs.problem.absence if e not in given]
-    bare = change_effects(fit.recipe, own)
+    bare = change_effects(fit.spec, own)
     near = sorted((c, k) for c, k in pool.values() if c < none + _MARGIN and k)[:_MOST_SETS]
     absent = [((f"-{e}", ()),) for e in own]
 

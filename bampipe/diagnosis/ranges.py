@@ -13,7 +13,7 @@ import numpy as np
 from bampipe.arrays import Array
 from bampipe.physics.effect import BoundEffect
 from bampipe.physics.parameter import Parameter
-from bampipe.trials.evidence import Evidence
+from bampipe.trials.linearisation import Linearisation
 
 _TRAVEL = (1e-4, 0.25)
 """Lengths, as shares of the travel; a shorter one is crossed within a sample or two."""
@@ -135,23 +135,23 @@ class MachineScale:
     band_hz: tuple[float, ...]
 
     @classmethod
-    def of_trials(cls, evidence: Evidence) -> MachineScale:
-        """Return the scale of the trials of ``evidence``."""
-        system, q, qd, load = evidence.system, [], [], []
-        for trial, motion in enumerate(evidence.motions):
-            applied = evidence.fitted[trial].applied
+    def of_trials(cls, linearisation: Linearisation) -> MachineScale:
+        """Return the scale of the trials of ``linearisation``."""
+        system, q, qd, load = linearisation.system, [], [], []
+        for trial, motion in enumerate(linearisation.motions):
+            applied = linearisation.fitted[trial].applied
             q += [motion.q.min(axis=0), motion.q.max(axis=0)]
             qd.append(np.abs(motion.qd).max(axis=0))
             load.append(np.abs(applied).max(axis=0))
-        times = [motion.t for motion in evidence.motions]
+        times = [motion.t for motion in linearisation.motions]
         middle = 0.5 * (np.min(q, axis=0) + np.max(q, axis=0))[None, :]
-        inertia = np.diagonal(system.mass_matrix(middle, evidence.p)[0])
+        inertia = np.diagonal(system.mass_matrix(middle, linearisation.p)[0])
         return cls(
             np.min(q, axis=0), np.max(q, axis=0), np.max(qd, axis=0), np.max(load, axis=0),
             inertia,
             {c.name: (c.unit, c.torque_unit) for c in system.model.device.coordinates},
             float(np.median(np.diff(times[0]))), max(float(np.ptp(t)) for t in times),
-            evidence.band.cutoff_hz,
+            linearisation.band.cutoff_hz,
         )  # fmt: skip
 
     def range_of(self, item: BoundEffect, parameter: Parameter) -> SearchRange:

@@ -23,7 +23,7 @@ from bampipe.diagnosis.session import (
     workers,
 )
 from bampipe.diagnosis.set_cost import added_effects, effect_names, removed_effects
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.compare import NOTICEABLE
 
 Progress = Callable[[float, str], None]
@@ -67,7 +67,7 @@ class Selection:
     @property
     def effects(self) -> tuple[str, ...]:
         """Effects that the most probable set adds to the given model."""
-        return tuple(e for e in self.final.recipe.effects if e not in self.initial.recipe.effects)
+        return tuple(e for e in self.final.spec.effects if e not in self.initial.spec.effects)
 
 
 @contextmanager
@@ -84,11 +84,11 @@ def open_search(
         without: effects that are excluded; only: the only effects to consider, if any.
         known: a search beside another model, whose equal columns are reused.
     """
-    wanted = only or session.candidate_names(fit.recipe, without)
-    candidates = {c.name: c for c in candidates_of(fit.recipe, wanted)}
+    wanted = only or session.candidate_names(fit.spec, without)
+    candidates = {c.name: c for c in candidates_of(fit.spec, wanted)}
     # The shapes of a candidate are shares of its range, which therefore must not change.
-    scale = known.dictionary.scale if known else MachineScale.of_trials(fit.evidence)
-    dictionary = Dictionary(fit.evidence, fit.likelihood.samples, candidates, scale)
+    scale = known.dictionary.scale if known else MachineScale.of_trials(fit.linearisation)
+    dictionary = Dictionary(fit.linearisation, fit.likelihood.samples, candidates, scale)
     with workers(dictionary, session.jobs) as spread:
 
         def make(keys: Sequence[Key]) -> Iterable[tuple[Key, Atom | None]]:
@@ -112,7 +112,7 @@ def make_columns(
 def _reusable(known: Search | None, dictionary: Dictionary) -> dict[Key, Atom | None]:
     """Return the columns of a known search whose candidates do not interact with either model."""
     if known is None or any(
-        d.evidence.system.moves_sensors for d in (known.dictionary, dictionary)
+        d.linearisation.system.moves_sensors for d in (known.dictionary, dictionary)
     ):
         return {}
     same = {
@@ -125,7 +125,7 @@ def _reusable(known: Search | None, dictionary: Dictionary) -> dict[Key, Atom | 
 
 def select_effects(
     session: Session,
-    recipe: Recipe,
+    spec: ModelSpec,
     start: Array,
     without: Collection[str] = (),
     progress: Progress = lambda fraction, message: None,
@@ -133,16 +133,16 @@ def select_effects(
     """Find the most probable set of effects that a model lacks.
 
     Args:
-        recipe: the model; start: its initial parameters, (n_p,).
+        spec: the model; start: its initial parameters, (n_p,).
         without: effects that are excluded.
 
     Raises:
         Runaway: the given model cannot be simulated.
     """
     progress(0.0, "simulating replicates of the model")
-    initial = current = session.fit(recipe, start)
+    initial = current = session.fit(spec, start)
     earlier = [current]
-    fits: dict[frozenset[str], Fit | None] = {frozenset(recipe.effects): current}
+    fits: dict[frozenset[str], Fit | None] = {frozenset(spec.effects): current}
     gains: dict[str, float] = {}
     known: Search | None = None
     last, left_out = False, set[str]()
@@ -154,7 +154,7 @@ def select_effects(
             if not gains:
                 beside = search.rank_additions((), len(search.dictionary.candidates))
                 gains = {key[0]: none - cost for cost, key in beside}
-            room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
+            room = session.criteria.most_effects - len(current.spec.effects) + len(spec.effects)
             pool = _explore(search, room, deep=room if number == 0 else min(_MOST_ADDED, room))
             moved, kept = None, dict[tuple[str, ...], float]()
             last |= number >= _MOST_ROUNDS - 1
@@ -165,7 +165,7 @@ def select_effects(
                     for cost, keys in sorted(pool.values())
                     if keys and cost < none + max(search.penalty_of(keys), -_LEAST_GAIN)
                 ]
-                better += _without_weakest(search, recipe.effects)
+                better += _without_weakest(search, spec.effects)
                 tell = partial(progress, 0.15 + 0.1 * number)
                 moved, kept = _fit_better(session, search, current, better, fits, tell)
                 # Under the noise of its own replicates, an earlier set may seem better again.
@@ -180,10 +180,10 @@ def select_effects(
                 progress(0.9, "comparing the gains with those on replicates")
                 replicate_gains = search.replicate_gains()
                 probabilities = weigh_sets(
-                    search, current, pool, recipe.effects, session.criteria, session.seed
+                    search, current, pool, spec.effects, session.criteria, session.seed
                 )
                 if number < _MOST_ROUNDS:
-                    moved = _leave_out(session, search, current, probabilities, recipe.effects)
+                    moved = _leave_out(session, search, current, probabilities, spec.effects)
                 if moved is None:
                     return Selection(
                         initial, current, probabilities, replicate_gains, search.largest_gain(),
@@ -191,7 +191,7 @@ def select_effects(
                     )  # fmt: skip
                 # After a second removal, nothing more is added.
                 last |= bool(left_out)
-                left_out |= {*current.recipe.effects} - {*moved.recipe.effects}
+                left_out |= {*current.spec.effects} - {*moved.spec.effects}
         current = moved
         earlier.append(current)
     raise AssertionError("the last round returns")
@@ -220,7 +220,7 @@ def _fit_better(
         # A set that contains one whose fit failed is no better.
         if any(one <= {*keys} for one in broken):
             continue
-        wider = change_set(current.recipe, keys)
+        wider = change_set(current.spec, keys)
         members = frozenset(wider.effects)
         if fresh := members not in fits:
             tell(f"fitting {', '.join(effect_names(keys))}")
@@ -258,7 +258,7 @@ def _leave_out(
     if it lowers the held-out error.
     """
     least = 1.0 - session.criteria.probability
-    own = [e for e in fit.recipe.effects if e not in given]
+    own = [e for e in fit.spec.effects if e not in given]
     out = {e for e in own if probabilities.if_all_known.get(e, 0.0) < least}
     out = out or _find_misleading(fit, probabilities, own)
     if not out:
@@ -266,7 +266,7 @@ def _leave_out(
     best = next(one.keys for one in probabilities.sets if one.unknown is None)
     best = best if out.intersection(removed_effects(best)) else ()
     keys = tuple(sorted({*best, *((f"-{e}", ()) for e in out)}))
-    less = change_set(fit.recipe, keys)
+    less = change_set(fit.spec, keys)
     if np.isfinite(search.cost(keys)):
         return session.try_fit(less, start_of(search, keys, less))
     return session.try_fit(less, start_at(search, np.zeros(search.bb.shape[1]), {}, less))
@@ -303,7 +303,7 @@ def gains_when_fitted(
     """
     if any(len(a) != len(b) for a, b in zip(before.problem.y, after.problem.y, strict=True)):
         return np.inf, np.inf
-    volume = search.volume_where_fitted(keys, after.evidence)
+    volume = search.volume_where_fitted(keys, after.linearisation)
     if volume is None:
         return -np.inf, -np.inf
     with_set, without = [
@@ -343,12 +343,12 @@ def _explore(search: Search, room: int, deep: int) -> Pool:
     return pool
 
 
-def change_set(recipe: Recipe, keys: Sequence[Key]) -> Recipe:
-    """Return the model of ``recipe`` with the changes of a set."""
-    return change_effects(recipe, removed_effects(keys), [name for name, _ in added_effects(keys)])
+def change_set(spec: ModelSpec, keys: Sequence[Key]) -> ModelSpec:
+    """Return the model of ``spec`` with the changes of a set."""
+    return change_effects(spec, removed_effects(keys), [name for name, _ in added_effects(keys)])
 
 
-def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
+def start_of(search: Search, keys: Sequence[Key], wider: ModelSpec) -> Array:
     """Return the parameters of a changed model from the solution of its set, (n_p,)."""
     solution, known = search.solve(keys), dict[str, float]()
     for key, strength in zip(added_effects(tuple(sorted(keys))), solution.strengths, strict=True):
@@ -366,16 +366,18 @@ def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
     return start_at(search, solution.base, known, wider)
 
 
-def start_at(search: Search, base: Array, known: Mapping[str, float], wider: Recipe) -> Array:
+def start_at(search: Search, base: Array, known: Mapping[str, float], wider: ModelSpec) -> Array:
     """Return the parameters of a changed model within their bounds, (n_p,).
 
     They are those of the model after the change ``base`` of its linear problem, and ``known`` ones.
     """
-    evidence = search.dictionary.evidence
-    found = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
+    linearisation = search.dictionary.linearisation
+    found = {
+        q.name: v for q, v in zip(linearisation.system.parameters, linearisation.p, strict=True)
+    }
     change = search.problem.to_parameters @ base
-    for place, number in enumerate(evidence.free):
-        found[evidence.system.parameters[number].name] += change[place]
+    for place, number in enumerate(linearisation.free):
+        found[linearisation.system.parameters[number].name] += change[place]
     found |= known
     system = system_of(wider)
     start = np.array([found.get(q.name, q.prior) for q in system.parameters])

@@ -21,10 +21,9 @@ from bampipe.diagnosis.criteria import Criteria
 from bampipe.estimate.least_squares import NotFinite
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics import System, compile_model
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.physics.registry import effect_from
 from bampipe.results.floor import FLOOR_SDS
-from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.likelihood import Likelihood, dry_friction
@@ -34,6 +33,7 @@ from bampipe.trials.linear_problem import (
     pose_problem,
     solve_bounded,
 )
+from bampipe.trials.linearisation import Linearisation, linearise_fit
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import NoiseFloor
 from bampipe.trials.replicates import SimulatedTrials, keep_motion, make_replicate
@@ -58,29 +58,29 @@ _candidates: dict[str, Candidate] = {}
 """Compiled models and candidates of this process, by `Model.key`."""
 
 
-def system_of(recipe: Recipe) -> System:
-    """Return the compiled model of a recipe."""
-    model = recipe.model()
+def system_of(spec: ModelSpec) -> System:
+    """Return the compiled model of a specification."""
+    model = spec.model()
     if model.key not in _systems:
         _systems[model.key] = compile_model(model)
     return _systems[model.key]
 
 
-def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
-    """Return the named candidates for a model with the effects of ``recipe``."""
-    device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
+def candidates_of(spec: ModelSpec, names: Sequence[str]) -> list[Candidate]:
+    """Return the named candidates for a model with the effects of ``spec``."""
+    device, extra = spec.model().device, [effect_from(e) for e in spec.extra]
     out = []
     for name in names:
-        model = build_candidate_model(device, name, extra, recipe.effects)
+        model = build_candidate_model(device, name, extra, spec.effects)
         if model.key not in _candidates:
             _candidates[model.key] = compile_candidate(model)
         out.append(_candidates[model.key])
     return out
 
 
-def acting_axes(recipe: Recipe, effect: str) -> tuple[int, ...]:
+def acting_axes(spec: ModelSpec, effect: str) -> tuple[int, ...]:
     """Return the axes whose equation an effect changes, whether or not the model has it."""
-    system = candidates_of(change_effects(recipe, (effect,)), (effect,))[0].system
+    system = candidates_of(change_effects(spec, (effect,)), (effect,))[0].system
     touched = range(len(system.coordinates)) if system.moves_sensors else system.touched
     item = next(item for item in system.model.effects if item.name == effect)
     named = [system.coordinates.index(axis) for axis in item.axes]
@@ -130,26 +130,26 @@ class Session:
     seed: int = 0
     requested_effects: tuple[str, ...] = ()
 
-    def candidate_names(self, recipe: Recipe, without: Collection[str] = ()) -> tuple[str, ...]:
-        """Return the effects that the model of ``recipe`` could have, except its own."""
-        extra = [effect_from(e) for e in recipe.extra]
-        present = (*recipe.effects, *without)
-        names = list_candidates(recipe.model().device, present, extra)
+    def candidate_names(self, spec: ModelSpec, without: Collection[str] = ()) -> tuple[str, ...]:
+        """Return the effects that the model of ``spec`` could have, except its own."""
+        extra = [effect_from(e) for e in spec.extra]
+        present = (*spec.effects, *without)
+        names = list_candidates(spec.model().device, present, extra)
         return (
             *names,
             *(name for name in self.requested_effects if name not in (*present, *names)),
         )
 
     def linearise(
-        self, recipe: Recipe, p: Array, like: Evidence | None = None, judged: bool = False
-    ) -> Evidence:
-        """Linearise the model of ``recipe`` at parameters ``p``, (n_p,).
+        self, spec: ModelSpec, p: Array, like: Linearisation | None = None, judged: bool = False
+    ) -> Linearisation:
+        """Linearise the model of ``spec`` at parameters ``p``, (n_p,).
 
         The trials are those that choose a model or, if asked, those by which it is ``judged``.
         """
         t = self._trial_subsets[judged]
-        return gather_evidence(
-            system_of(recipe), t.motions, t.band, p, t.folds,
+        return linearise_fit(
+            system_of(spec), t.motions, t.band, p, t.folds,
             most_iterations=0, timing=t.timing, like=like,
         )  # fmt: skip
 
@@ -160,17 +160,17 @@ class Session:
         both = choosing, self.trials.folds.judged
         return [self.trials.subset(np.flatnonzero(counts).tolist()) for counts in both]
 
-    def replicate(self, evidence: Evidence, count: int) -> Sequence[Array]:
+    def replicate(self, linearisation: Linearisation, count: int) -> Sequence[Array]:
         """Return the residuals of replicates of a fitted model, by trial, each (K, n_q, count).
 
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
         seeds = [(self.seed, _SEED, k) for k in range(count)]
-        return self._replicate(evidence, evidence.system, self.trials.sensors, seeds)
+        return self._replicate(linearisation, linearisation.system, self.trials.sensors, seeds)
 
     def _replicate(
-        self, e: Evidence, system: System, sensors: Sensors, seeds: Sequence[Seed]
+        self, e: Linearisation, system: System, sensors: Sensors, seeds: Sequence[Seed]
     ) -> Sequence[Array]:
         simulated = SimulatedTrials(system, e.p, e.motions, sensors.rate_hz)
         parts = [[seed] for seed in seeds] if self.jobs > 1 else [seeds]
@@ -182,32 +182,36 @@ class Session:
             found = spread(_replicate_trial, tasks)
             return KeptItems(np.concatenate([next(found) for _ in parts], axis=2) for _ in trials)
 
-    def replicate_stopping(self, recipe: Recipe, evidence: Evidence) -> list[Array]:
+    def replicate_stopping(self, spec: ModelSpec, linearisation: Linearisation) -> list[Array]:
         """Return the residual of a replicate without noise whose friction truly stops, by trial.
 
         It is zero if the motion is prescribed, or if the simulation diverges. Controllers keep a
         robot on its path, so that there only the width of the sign changes the friction.
         """
-        t, nothing = self.trials, [np.zeros_like(r) for r in evidence.residual]
-        if keep_motion(evidence.fitted):
+        t, nothing = self.trials, [np.zeros_like(r) for r in linearisation.residual]
+        if keep_motion(linearisation.fitted):
             return nothing
-        if evidence.system.model.device.robot is not None:
-            return _narrower_friction(evidence)
-        none = np.zeros(len(evidence.system.coordinates))
+        if linearisation.system.model.device.robot is not None:
+            return _narrower_friction(linearisation)
+        none = np.zeros(len(linearisation.system.coordinates))
         exact = replace(
             t.sensors, resolution=none, reading_sd=none, force_sd=np.zeros_like(t.sensors.force_sd)
         )
-        narrow = system_of(recipe.with_sign_widths(_STOPPING_WIDTH))
+        narrow = system_of(spec.with_sign_widths(_STOPPING_WIDTH))
         try:
-            found = self._replicate(evidence, narrow, exact, [(self.seed,)])
+            found = self._replicate(linearisation, narrow, exact, [(self.seed,)])
         except Runaway:
             return nothing
         return [values[:, :, 0] for values in found]
 
     def weight_samples(
-        self, recipe: Recipe, evidence: Evidence, noise: Noise | None = None, count: int = 0
+        self,
+        spec: ModelSpec,
+        linearisation: Linearisation,
+        noise: Noise | None = None,
+        count: int = 0,
     ) -> Likelihood:
-        """Return the likelihood of the trials of ``evidence``, with noise from replicates.
+        """Return the likelihood of the trials of ``linearisation``, with noise from replicates.
 
         Args:
             noise: noise from replicates of another model, to use instead.
@@ -217,42 +221,42 @@ class Session:
             Runaway: the simulated motion grows without bounds.
         """
         c = self.criteria
-        samples = lay_out_samples(evidence, c.block_s)
+        samples = lay_out_samples(linearisation, c.block_s)
         if noise is None:
-            residuals = self.replicate(evidence, count or c.replicates)
-            stopping = self.replicate_stopping(recipe, evidence)
-            noise = describe_noise(residuals, stopping, evidence, samples)
+            residuals = self.replicate(linearisation, count or c.replicates)
+            stopping = self.replicate_stopping(spec, linearisation)
+            noise = describe_noise(residuals, stopping, linearisation, samples)
         force_sd = self.trials.sensors.force_sd
-        return Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy, force_sd)
+        return Likelihood.of(linearisation, samples, noise, c.bias_error, c.discrepancy, force_sd)
 
     def fit(
-        self, recipe: Recipe, start: Array, noise: Noise | None = None, lacking: float = np.inf
+        self, spec: ModelSpec, start: Array, noise: Noise | None = None, lacking: float = np.inf
     ) -> Fit:
         """Fit a model under the likelihood.
 
         Args:
-            recipe: the model; start: its initial parameters, (n_p,).
+            spec: the model; start: its initial parameters, (n_p,).
             noise: noise from replicates; by default those of this model at ``start``.
             lacking: scale above which all samples of an axis have equal weight.
 
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
-        evidence, c = self.linearise(recipe, start), self.criteria
-        likelihood = self.weight_samples(recipe, evidence, noise)
-        evidence, problem = self._descend(recipe, evidence, likelihood)
+        linearisation, c = self.linearise(spec, start), self.criteria
+        likelihood = self.weight_samples(spec, linearisation, noise)
+        linearisation, problem = self._descend(spec, linearisation, likelihood)
         log_likelihood = problem.log_likelihood()
         # The error of the biases depends on the fitted residual.
-        likelihood = self.weight_samples(recipe, evidence, likelihood.noise)
-        rows = pose_problem(likelihood, evidence).residual_rows()
+        likelihood = self.weight_samples(spec, linearisation, likelihood.noise)
+        rows = pose_problem(likelihood, linearisation).residual_rows()
         likelihood = likelihood.with_heavy_tails(rows, c.tails)
         likelihood = likelihood.with_equal_weights(problem.residual_rows(), lacking)
-        evidence, problem = self._descend(recipe, evidence, likelihood)
-        return Fit(recipe, evidence, likelihood, problem, log_likelihood)
+        linearisation, problem = self._descend(spec, linearisation, likelihood)
+        return Fit(spec, linearisation, likelihood, problem, log_likelihood)
 
     def _descend(
-        self, recipe: Recipe, evidence: Evidence, likelihood: Likelihood
-    ) -> tuple[Evidence, LinearProblem]:
+        self, spec: ModelSpec, linearisation: Linearisation, likelihood: Likelihood
+    ) -> tuple[Linearisation, LinearProblem]:
         """Take Gauss-Newton steps to the most likely parameters within their bounds.
 
         A step is accepted if it lowers the cost with refitted nuisance parameters, since the
@@ -261,7 +265,7 @@ class Session:
         Raises:
             ValueError: fewer samples are clear of standstill than there are parameters.
         """
-        problem, count = pose_problem(likelihood, evidence), len(evidence.free)
+        problem, count = pose_problem(likelihood, linearisation), len(linearisation.free)
         if sum(map(len, problem.y)) <= count:
             raise ValueError("fewer samples clear of standstill than parameters")
         here = problem.solve_nuisance(count).cost
@@ -271,11 +275,11 @@ class Session:
                 break
             step = problem.to_parameters @ promised.base
             for share in _STEP_LENGTHS:
-                p = evidence.p.copy()
-                p[list(evidence.free)] += share * step[:count]
-                p = np.clip(p, *bounds_of(evidence.system))
+                p = linearisation.p.copy()
+                p[list(linearisation.free)] += share * step[:count]
+                p = np.clip(p, *bounds_of(linearisation.system))
                 try:
-                    moved = self.linearise(recipe, p, evidence)
+                    moved = self.linearise(spec, p, linearisation)
                 except NotFinite:
                     continue
                 tried = pose_problem(likelihood, moved)
@@ -284,34 +288,36 @@ class Session:
                     break
             else:
                 break
-            evidence, problem, here = moved, tried, there
-        return evidence, problem
+            linearisation, problem, here = moved, tried, there
+        return linearisation, problem
 
-    def judge(self, recipe: Recipe, p: Array, count: int = 0) -> Fit:
+    def judge(self, spec: ModelSpec, p: Array, count: int = 0) -> Fit:
         """Compare a given model with ``count`` replicates on the trials that judge it.
 
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
-        evidence = self.linearise(recipe, p, judged=True)
-        likelihood = self.weight_samples(recipe, evidence, count=count)
-        return Fit(recipe, evidence, likelihood, pose_problem(likelihood, evidence), is_given=True)
+        linearisation = self.linearise(spec, p, judged=True)
+        likelihood = self.weight_samples(spec, linearisation, count=count)
+        return Fit(
+            spec, linearisation, likelihood, pose_problem(likelihood, linearisation), is_given=True
+        )
 
-    def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
+    def fit_plainly(self, spec: ModelSpec, start: Array) -> Fit:
         """Fit a model with equal noise for all samples of an axis, without replicates."""
-        evidence = self.linearise(recipe, start)
-        samples = lay_out_samples(evidence, self.criteria.block_s)
-        nothing = [np.zeros_like(r) for r in evidence.residual]
-        silent = [np.zeros((*r.shape, 2)) for r in evidence.residual]
-        noise = describe_noise(silent, nothing, evidence, samples)
-        flat = Likelihood.of(evidence, samples, noise, 0.0, 0.0, self.trials.sensors.force_sd)
-        evidence, problem = self._descend(recipe, evidence, flat)
-        return Fit(recipe, evidence, flat, problem)
+        linearisation = self.linearise(spec, start)
+        samples = lay_out_samples(linearisation, self.criteria.block_s)
+        nothing = [np.zeros_like(r) for r in linearisation.residual]
+        silent = [np.zeros((*r.shape, 2)) for r in linearisation.residual]
+        noise = describe_noise(silent, nothing, linearisation, samples)
+        flat = Likelihood.of(linearisation, samples, noise, 0.0, 0.0, self.trials.sensors.force_sd)
+        linearisation, problem = self._descend(spec, linearisation, flat)
+        return Fit(spec, linearisation, flat, problem)
 
-    def try_fit(self, recipe: Recipe, start: Array) -> Fit | None:
+    def try_fit(self, spec: ModelSpec, start: Array) -> Fit | None:
         """Apply `fit`; None if the model cannot be simulated or its residual is not finite."""
         try:
-            return self.fit(recipe, start)
+            return self.fit(spec, start)
         except (Runaway, NotFinite):
             return None
 
@@ -327,15 +333,15 @@ class Fit:
     """A model fitted under the likelihood.
 
     Attributes:
-        recipe: the model; evidence: its linearisation at the estimate.
+        spec: the model; linearisation: of its residual at the estimate.
         likelihood: noise and weights; problem: the weighted linear problem.
         log_likelihood: log likelihood under the normal noise of its own replicates, nats, which
             ranks fits with different replicates; nan for other noise.
         is_given: whether the parameters are given and only nuisance parameters are fitted.
     """
 
-    recipe: Recipe
-    evidence: Evidence
+    spec: ModelSpec
+    linearisation: Linearisation
     likelihood: Likelihood
     problem: LinearProblem
     log_likelihood: float = float("nan")
@@ -344,16 +350,16 @@ class Fit:
     @property
     def effect_parameters(self) -> dict[str, float]:
         """Values of the parameters of the effects, by name."""
-        system = self.evidence.system
+        system = self.linearisation.system
         count = len(system.model.device.parameters)
-        pairs = zip(system.parameters[count:], self.evidence.p[count:], strict=True)
+        pairs = zip(system.parameters[count:], self.linearisation.p[count:], strict=True)
         return {item.name: float(value) for item, value in pairs}
 
     @cached_property
     def solution(self) -> LinearSolution:
         """The solution of the linear problem; at the estimate, only nuisance parameters move."""
         if self.is_given:
-            return self.problem.solve_nuisance(len(self.evidence.free))
+            return self.problem.solve_nuisance(len(self.linearisation.free))
         return self.problem.solve()
 
     @cached_property
@@ -406,7 +412,7 @@ class Fit:
 
     def count_independent(self, criteria: Criteria) -> tuple[Samples, ...]:
         """Return the samples of each axis with the number that are independent in the residual."""
-        band = self.evidence.band
+        band = self.linearisation.band
         lags = int(criteria.block_s * band.rate_hz / band.step)
         return self.likelihood.count_independent(self.problem.residual_rows(), lags)
 
@@ -420,7 +426,7 @@ class Fit:
 
     def held_out_without(self, effects: Iterable[str] = ()) -> Array:
         """Return `held_out_rmse` without some of the model's effects."""
-        e, samples = self.evidence, self.likelihood.samples
+        e, samples = self.linearisation, self.likelihood.samples
         plain = [take_samples(e.residual, here, axis) for axis, here in enumerate(samples)]
         slopes = [take_samples(e.slopes, here, axis) for axis, here in enumerate(samples)]
         squares = np.zeros(len(samples))
@@ -444,7 +450,7 @@ class Fit:
     def _solve_held_out(self, effects: Iterable[str]) -> Iterator[tuple[list[Flags], Array]]:
         """Yield the samples of each group of trials, by axis, and the unknowns without them."""
         p, absent, weight = self.problem, self.problem.removal(effects), self.solution.weight
-        groups, group_of = np.unique(self.evidence.folds.groups, return_inverse=True)
+        groups, group_of = np.unique(self.linearisation.folds.groups, return_inverse=True)
         parts = [group_of[here.trial] for here in self.likelihood.samples]
         sums, is_unseen = p.sums(), len(groups) > 1
         for k, own in enumerate(zip(*p.sums_of(parts, len(groups)), strict=True)):
@@ -470,9 +476,9 @@ def _replicate_trial(task: tuple[int, Sequence[Seed]]) -> Array:
     return np.stack([values * e.used[trial] for values in thin], axis=2)
 
 
-def _narrower_friction(evidence: Evidence) -> list[Array]:
+def _narrower_friction(linearisation: Linearisation) -> list[Array]:
     """Return the residual of friction with a narrower sign than the model's, by trial, (K, n_q)."""
-    e = evidence
+    e = linearisation
     width = e.system.sign_widths
     rows = (
         dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width))
@@ -482,6 +488,8 @@ def _narrower_friction(evidence: Evidence) -> list[Array]:
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 
 
-def change_effects(recipe: Recipe, removed: Collection[str], more: Sequence[str] = ()) -> Recipe:
+def change_effects(
+    spec: ModelSpec, removed: Collection[str], more: Sequence[str] = ()
+) -> ModelSpec:
     """Return the model without some of its effects, and with ``more``."""
-    return replace(recipe, effects=(*(e for e in recipe.effects if e not in removed), *more))
+    return replace(spec, effects=(*(e for e in spec.effects if e not in removed), *more))

@@ -18,7 +18,6 @@ from scipy.linalg import block_diag
 from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
-from bampipe.trials.evidence import Evidence
 from bampipe.trials.linear_problem import (
     NOTHING,
     LinearProblem,
@@ -26,6 +25,7 @@ from bampipe.trials.linear_problem import (
     solve_bounded,
     solve_scaled,
 )
+from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.samples import Samples
 from bampipe.trials.scale import log_of_share
 
@@ -189,7 +189,7 @@ class SetCosts:
         delays = sum(self.dictionary.candidates[name].takes_timing for name, _ in keys)
         if delays:
             absent |= p.no_delay
-        present = self.dictionary.evidence.system.timing_effects
+        present = self.dictionary.linearisation.system.timing_effects
         delays += bool(present.difference(removed_effects(all_keys)))
         if delays > 1 or any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
@@ -310,12 +310,14 @@ class SetCosts:
         blocks = [expect_strengths([*x.values()], [applied[a] for a in x]) for x in parts]
         return np.asarray(block_diag(*blocks)) if blocks else np.zeros((0, 0))
 
-    def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
+    def volume_where_fitted(
+        self, keys: Sequence[Key], linearisation: Linearisation
+    ) -> Array | None:
         """Return the change of variables of a set at the parameters of a model fitted with it."""
-        base = self.dictionary.evidence
-        gain, scale = evidence.filter_gain[0] / base.filter_gain[0], self.solve(keys).scale
+        base = self.dictionary.linearisation
+        gain, scale = linearisation.filter_gain[0] / base.filter_gain[0], self.solve(keys).scale
         rows = self._log_of_slopes([({}, gain)], scale)
-        scale = evidence.log_scale[0] - base.log_scale[0]
+        scale = linearisation.log_scale[0] - base.log_scale[0]
         return self._volume([r + here for r, here in zip(rows, scale, strict=True)])
 
     def _volume(self, rows: Sequence[Array]) -> Array | None:
@@ -324,7 +326,7 @@ class SetCosts:
         ``rows`` are the logarithms of the factors on the measured force at each sample, by axis.
         """
         means = np.array([float(r.mean()) if len(r) else 0.0 for r in rows])
-        left = self.dictionary.evidence.log_scale[0] + means
+        left = self.dictionary.linearisation.log_scale[0] + means
         if (left < np.log(_LEAST_SLOPE)).any():
             return None
         return np.asarray(self.problem.independent * means * self._moves_noise)
@@ -376,7 +378,7 @@ class SetCosts:
         """Return the cost of the priors of the parameters of one of the model's effects."""
         if name not in self._own_penalties:
             # As for a candidate, the information on the strengths is that at a given shape.
-            p, e, shapes = self.problem, self.dictionary.evidence, self.problem.shapes[name]
+            p, e, shapes = self.problem, self.dictionary.linearisation, self.problem.shapes[name]
             away = {k: change for k, change in p.absence[name].items() if k not in shapes}
             free = p.hold(dict.fromkeys(shapes, 0.0))[1]
             to = p.to_parameters[list(away)] @ free

@@ -9,7 +9,7 @@ from bampipe.arrays import Array, Indices
 from bampipe.estimate.low_pass import Band
 from bampipe.physics.effect import state_units
 from bampipe.results.diagnose import WorstWindow
-from bampipe.trials.evidence import Evidence
+from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
@@ -111,10 +111,12 @@ def share_between(values: Array, which: Indices) -> float:
     return min(1.0, between / total) if total > 0.0 else 0.0
 
 
-def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = BINS) -> Map:
+def residual_map(
+    linearisation: Linearisation, axis: int, variable: Variable, bins: int = BINS
+) -> Map:
     """Average the residual of ``axis`` in ``bins`` parts of ``variable`` with equal counts."""
-    use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
-    r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
+    use = np.concatenate([u[:, axis] for u in linearisation.used]) > 0
+    r = np.concatenate([x[:, axis] for x in linearisation.residual])[use]
     v = np.concatenate(variable.values)[use]
     levels = np.unique(v)
     which = np.searchsorted(levels, v) if len(levels) <= bins else number_bins(v, bins)
@@ -127,30 +129,32 @@ def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = 
         none = np.zeros(0)
         return Map(variable.name, variable.unit, none, none, none, none, none, 0.0)
     center, mean, sd, n = (np.array(c, dtype=float) for c in zip(*rows, strict=True))
-    independent = n * evidence.band.independent_share[axis]
+    independent = n * linearisation.band.independent_share[axis]
     half = 1.96 * sd / np.sqrt(np.maximum(independent, 2.0))
     share = float(np.sum(n * (mean - r.mean()) ** 2) / max(np.sum((r - r.mean()) ** 2), 1e-30))
     return Map(variable.name, variable.unit, center, mean, mean - half, mean + half, n, share)
 
 
-def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> list[WorstWindow]:
+def worst_windows(
+    linearisation: Linearisation, count: int = 10, width_s: float = 0.5
+) -> list[WorstWindow]:
     """Return the ``count`` windows with the largest error relative to that of their axis.
 
     The worst window of each axis is always among them.
     """
-    band, system = evidence.band, evidence.system
+    band, system = linearisation.band, linearisation.system
     length = max(2, int(width_s * band.rate_hz / band.step))
-    typical = evidence.rmse()
+    typical = linearisation.rmse()
     found: list[tuple[float, WorstWindow]] = []
-    for k, motion in enumerate(evidence.motions):
+    for k, motion in enumerate(linearisation.motions):
         kept = band.thinned_rows(len(motion.t))
         for start in range(0, len(kept) - length + 1, length):
             rows = slice(start, start + length)
             for axis, name in enumerate(system.coordinates):
-                n = evidence.used[k][rows, axis].sum()
+                n = linearisation.used[k][rows, axis].sum()
                 if n < 0.5 * length:
                     continue
-                rmse = float(np.sqrt(np.sum(evidence.residual[k][rows, axis] ** 2) / n))
+                rmse = float(np.sqrt(np.sum(linearisation.residual[k][rows, axis] ** 2) / n))
                 t = motion.t[kept[rows]]
                 window = WorstWindow(
                     axis=name,

@@ -13,7 +13,7 @@ from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Fit, Session, system_of
 from bampipe.diagnosis.set_cost import effect_names, removed_effects
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.trials.measured import MeasuredTrials
 
 _ANY_SIZE = 1e-9
@@ -26,15 +26,17 @@ LEAST_DROP = 0.03
 """Smallest drop of the log error for a narrower width: `benchmarks/chosen_sign_width.py`."""
 
 
-def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
+def search_start(trials: MeasuredTrials, spec: ModelSpec) -> Array:
     """Return starting values of the parameters of a model within their bounds, (n_p,).
 
     The device's parameters are fitted from their priors. The shapes of effects are searched over
     their ranges as in a diagnosis, since a descent from the prior would end in the nearest minimum.
     """
     session = Session(trials, Criteria(size=_ANY_SIZE, replicates=_REPLICATES))
-    current, left = replace(recipe, effects=()), recipe.effects
-    fit = _fit(session, current, session.fit_plainly(current, system_of(current).prior).evidence.p)
+    current, left = replace(spec, effects=()), spec.effects
+    fit = _fit(
+        session, current, session.fit_plainly(current, system_of(current).prior).linearisation.p
+    )
     while left:
         with open_search(session, fit, only=left) as search:
             every = (s for beam in search.grow_sets(len(left)) for s in beam)
@@ -44,13 +46,16 @@ def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
             current = replace(current, effects=(*current.effects, *found))
             start = start_of(search, keys, current)
         fit, left = _fit(session, current, start), tuple(e for e in left if e not in found)
-    known = {q.name: v for q, v in zip(fit.evidence.system.parameters, fit.evidence.p, strict=True)}
-    return np.array([known[q.name] for q in system_of(recipe).parameters])
+    known = {
+        q.name: v
+        for q, v in zip(fit.linearisation.system.parameters, fit.linearisation.p, strict=True)
+    }
+    return np.array([known[q.name] for q in system_of(spec).parameters])
 
 
-def _fit(session: Session, recipe: Recipe, start: Array) -> Fit:
+def _fit(session: Session, spec: ModelSpec, start: Array) -> Fit:
     """Fit a model with noise from replicates, or with equal noise if it cannot be simulated."""
-    return session.try_fit(recipe, start) or session.fit_plainly(recipe, start)
+    return session.try_fit(spec, start) or session.fit_plainly(spec, start)
 
 
 @dataclass(frozen=True)
@@ -67,15 +72,15 @@ class SignWidth:
     chosen: Array
 
 
-def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
+def choose_sign_width(trials: MeasuredTrials, spec: ModelSpec) -> SignWidth:
     """Choose the width for a model by the held-out error of least squares.
 
     Raises:
         ValueError: the trials are too short to be fitted.
     """
     fits = {
-        1.0: fit_width(trials, recipe, 1.0),
-        _STOPPING_FACTOR: fit_width(trials, recipe, _STOPPING_FACTOR),
+        1.0: fit_width(trials, spec, 1.0),
+        _STOPPING_FACTOR: fit_width(trials, spec, _STOPPING_FACTOR),
     }
     declared = fits[1.0].held_out_rmse
     count = fits[1.0].problem.independent
@@ -86,13 +91,13 @@ def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
 
     if not drop(_STOPPING_FACTOR) > LEAST_DROP:
         return SignWidth(1.0, declared, declared)
-    fits |= {f: fit_width(trials, recipe, f) for f in _NARROW_FACTORS if f not in fits}
+    fits |= {f: fit_width(trials, spec, f) for f in _NARROW_FACTORS if f not in fits}
     best = max(_NARROW_FACTORS, key=drop)
     return SignWidth(best, declared, fits[best].held_out_rmse)
 
 
-def fit_width(trials: MeasuredTrials, recipe: Recipe, factor: float) -> Fit:
+def fit_width(trials: MeasuredTrials, spec: ModelSpec, factor: float) -> Fit:
     """Fit a model with its sign widths multiplied by ``factor``."""
-    narrowed = recipe.with_sign_widths(factor)
+    narrowed = spec.with_sign_widths(factor)
     session = Session(trials, Criteria())
     return session.fit_plainly(narrowed, search_start(trials, narrowed))

@@ -14,8 +14,8 @@ from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.set_cost import SetCosts, removed_effects
 from bampipe.diagnosis.shape import since_reversal
-from bampipe.trials.evidence import Evidence
 from bampipe.trials.linear_problem import solve_scaled
+from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.samples import take_samples
 
 _KNOTS = (9, 33), (9,), (9,), (9,)
@@ -70,7 +70,7 @@ class Splines:
 
 def build_splines(costs: SetCosts, axis: int) -> Splines | None:
     """Return the splines of an axis; None if the axis does not move."""
-    p, e = costs.problem, costs.dictionary.evidence
+    p, e = costs.problem, costs.dictionary.linearisation
     if len(p.y[axis]) <= costs.bb.shape[1]:
         return None
     width = e.system.model.device.coordinates[axis].sign_width
@@ -103,7 +103,7 @@ def _find_vibration(costs: SetCosts, axis: int) -> tuple[Array, int]:
 
     It has one frequency, and in each trial an amplitude and a phase: (n, 2 n_trials).
     """
-    p, e = costs.problem, costs.dictionary.evidence
+    p, e = costs.problem, costs.dictionary.linearisation
     samples = p.likelihood.samples[axis]
     counts = [len(used) for used in e.used]
     left = np.zeros(sum(counts))
@@ -120,10 +120,10 @@ def _find_vibration(costs: SetCosts, axis: int) -> tuple[Array, int]:
     return columns[samples.rows], len(power) - first
 
 
-def _quantities(evidence: Evidence, trial: int, axis: int) -> list[Array]:
-    motion, n_q = evidence.motions[trial], len(evidence.system.coordinates)
+def _quantities(linearisation: Linearisation, trial: int, axis: int) -> list[Array]:
+    motion, n_q = linearisation.motions[trial], len(linearisation.system.coordinates)
     since, _ = since_reversal(motion, axis)
-    fitted = evidence.fitted[trial]
+    fitted = linearisation.fitted[trial]
     # The modelled load, since a function of the measured load could cancel it.
     load = (fitted.applied - fitted.residual)[:, axis]
     return [

@@ -49,9 +49,9 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
         e: min(share, cap_probability(p_values.get(e, 0.0)))
         for e, share in probabilities.effects.items()
     }
-    where = {e: acting_axes(initial.recipe, e) for e in probability}
+    where = {e: acting_axes(initial.spec, e) for e in probability}
     axes = list[AxisVerdict]()
-    for number in range(len(final.evidence.system.coordinates)):
+    for number in range(len(final.linearisation.system.coordinates)):
         likely = [(e, p) for e, p in probability.items() if p >= 1.0 - c.probability]
         here = [pair for pair in likely if number in where[pair[0]]]
         listed = dict(sorted(here, key=lambda pair: -pair[1]))
@@ -117,7 +117,7 @@ def _judge(
         noise_floor=level,
         noise_floor_sd=scatter,
         standing=against_floor,
-        unit=final.evidence.system.torque_units[axis],
+        unit=final.linearisation.system.torque_units[axis],
         force_rms=force,
         explained=max(0.0, 1.0 - (after / max(force, 1e-300)) ** 2),
         explainable_share=max(0.0, 1.0 - rest),
@@ -141,7 +141,7 @@ def rank_effects(
     """
     initial, final = selection.initial, selection.final
     values = final.effect_parameters
-    own = {item.name: item.parameters for item in final.evidence.system.model.effects}
+    own = {item.name: item.parameters for item in final.linearisation.system.model.effects}
     unchosen = (e for e in selection.gains if e not in selection.effects)
     others = sorted(unchosen, key=lambda e: -selection.gains[e])
     chosen = sorted(selection.effects, key=lambda e: -selection.probabilities.drops.get(e, 0.0))
@@ -152,13 +152,13 @@ def rank_effects(
         gain = (
             selection.probabilities.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
         )
-        axis = max(acting_axes(initial.recipe, effect), key=lambda a: float(left[a]))
+        axis = max(acting_axes(initial.spec, effect), key=lambda a: float(left[a]))
         before = after = float(fit.held_out_rmse[axis])
         if is_chosen:
             before = float(final.held_out_without([effect])[axis])
         else:
             after *= float(np.exp(-gain / max(initial.problem.independent[axis], 1.0)))
-        system = fit.evidence.system
+        system = fit.linearisation.system
         rows.append(
             RankedEffect(
                 effect=effect,
@@ -188,7 +188,7 @@ def _find_twins(selection: Selection, effect: str, mentioned: float) -> tuple[st
 
 
 def _list_sets(selection: Selection) -> tuple[WeighedSet, ...]:
-    sets, axes = selection.probabilities.sets, selection.final.evidence.system.coordinates
+    sets, axes = selection.probabilities.sets, selection.final.linearisation.system.coordinates
     listed = [s for s in sets if s.probability >= 0.001] or sets[:1]
     return tuple(
         WeighedSet(

@@ -11,7 +11,7 @@ from bampipe.arrays import Array
 from bampipe.identification.estimates import Estimate
 from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.physics import System, compile_model
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.ingest import IngestResult
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
@@ -20,7 +20,7 @@ from bampipe.trials.signals import ZERO_OF, Signals, calibration_changes
 
 def propagate_calibration(
     system: System,
-    recipe: Recipe,
+    spec: ModelSpec,
     session: IngestResult,
     motions: Sequence[Motion],
     squares: SquaresFit,
@@ -35,8 +35,8 @@ def propagate_calibration(
     """
     count = int(np.sum(squares.free < len(system.parameters)))
     held = [int(k) for k in np.flatnonzero(squares.at_bound)]
-    found, p, late_s = {}, squares.fit.evidence.p, squares.trials.late_s
-    for name, theirs, change in _sources(system, recipe, session):
+    found, p, late_s = {}, squares.fit.linearisation.p, squares.trials.late_s
+    for name, theirs, change in _sources(system, spec, session):
         timed = (change(motion).with_input_timing(late_s) for motion in motions)
         changed = (ModelOnTrial(theirs, p, [motion]).residual_once for motion in timed)
         found[name] = squares.respond(squares.residual_change(changed), held)[:count]
@@ -59,17 +59,17 @@ def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate
 
 
 def _sources(
-    system: System, recipe: Recipe, session: IngestResult
+    system: System, spec: ModelSpec, session: IngestResult
 ) -> Iterator[tuple[str, System, Callable[[Motion], Motion]]]:
     """Yield sources of uncertainty, each with model and motion changed by its standard one."""
     signals = Signals.of_session(system, session)
     for name, change in calibration_changes(signals):
         yield name, system, partial(change.of_motion, signals=signals)
     for name, constant in system.model.device.constants.items():
-        if constant.sd and name in recipe.device.get("constants", {}):
-            declaration = deepcopy(dict(recipe.device))
+        if constant.sd and name in spec.device.get("constants", {}):
+            declaration = deepcopy(dict(spec.device))
             declaration["constants"][name]["value"] = constant.value + constant.sd
-            changed = compile_model(replace(recipe, device=declaration).model())
+            changed = compile_model(replace(spec, device=declaration).model())
             yield name, changed, lambda motion: motion
 
 

@@ -48,7 +48,7 @@ from bampipe.identification.sensor_noise import (
 )
 from bampipe.lists import join_names
 from bampipe.physics import System, compile_model
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.progress import Progress
 from bampipe.results.rounding import significant
 from bampipe.trials.disturbances import part_trials
@@ -88,7 +88,7 @@ class Filtering:
         self,
         run: RunFolder,
         system: System,
-        recipe: Recipe,
+        spec: ModelSpec,
         name: str,
         start: Array,
         squares: SquaresFit,
@@ -100,12 +100,12 @@ class Filtering:
         """Read the trials and tune the noise levels.
 
         Args:
-            recipe: the model's specification; name: its name in messages.
+            spec: the model's specification; name: its name in messages.
             start: (n_p,) initial values.
             squares: the least-squares fit, which gives the region of the answer.
             sd: (n,) its standard deviations, those of the prior for undetermined parameters.
         """
-        self.system, self.recipe, self.name, self.start = system, recipe, name, start
+        self.system, self.spec, self.name, self.start = system, spec, name, start
         self.squares, self.sd, self.noise, self.report_progress = (
             squares,
             sd,
@@ -144,7 +144,7 @@ class Filtering:
 
     def narrowed(self, factor: float) -> System:
         """The model with the widths of its smoothed signs multiplied by a factor."""
-        return compile_model(self.recipe.with_sign_widths(factor).model())
+        return compile_model(self.spec.with_sign_widths(factor).model())
 
     @property
     def answer(self) -> Array:

@@ -29,7 +29,7 @@ from bampipe.estimate.standstill import find_moving_samples
 from bampipe.identification.estimates import Estimate, input_timing
 from bampipe.identification.filter_tables import as_filtered
 from bampipe.physics import System
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.identify import Convergence, StateBound
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.linear_problem import solve_bounded
@@ -137,9 +137,9 @@ class SquaresFit:
 
     def residual_change(self, residual: Iterable[Array]) -> list[Array]:
         """Return the differences of unfiltered residuals (T, n_q) from its own, by axis, (n,)."""
-        evidence, samples = self.fit.evidence, self.fit.likelihood.samples
-        thin = evidence.band.thin_trials(residual, range(len(samples)))
-        change = [there - here for there, here in zip(thin, evidence.residual, strict=True)]
+        linearisation, samples = self.fit.linearisation, self.fit.likelihood.samples
+        thin = linearisation.band.thin_trials(residual, range(len(samples)))
+        change = [there - here for there, here in zip(thin, linearisation.residual, strict=True)]
         return [take_samples(change, here, axis) for axis, here in enumerate(samples)]
 
     @cached_property
@@ -149,11 +149,14 @@ class SquaresFit:
         inverse = invert_scaled(self.normal)
         fitted = float(np.trace(inverse @ (self.normal - pose.precision)))
         # With fewer than three blocks per parameter, use shorter blocks.
-        band, seconds = self.trials.band, sum(self.fit.evidence.sizes) / self.trials.band.rate_hz
+        band, seconds = (
+            self.trials.band,
+            sum(self.fit.linearisation.sizes) / self.trials.band.rate_hz,
+        )
         most = max(
             seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), _PERIODS / min(band.cutoff_hz)
         )
-        samples = lay_out_samples(self.fit.evidence, min(self.block_s, most))
+        samples = lay_out_samples(self.fit.linearisation, min(self.block_s, most))
         tailed = [_TAILED if np.ptp(root) > 0.0 else 1.0 for root in self.fit.likelihood.root]
         rows = ((x, left / by) for (x, left), by in zip(self.rows, tailed, strict=True))
         independent = [s.independent * by**2 for s, by in zip(samples, tailed, strict=True)]
@@ -229,7 +232,9 @@ class SquaresFit:
         ``p`` (n_p + 1,) is the estimate, by any method; it is moved as least squares are.
         """
         trials, limits = self.trials, (self.problem.lower, self.problem.upper)
-        problem = problem_of(self.fit.evidence.system, self.parts, trials.band, timing=trials.timed)
+        problem = problem_of(
+            self.fit.linearisation.system, self.parts, trials.band, timing=trials.timed
+        )
 
         def residual(part: int) -> Array:
             without = p.copy()
@@ -241,12 +246,12 @@ class SquaresFit:
 
     def find_worst_second(self) -> RemovedStretch:
         """Return the second of a trial without which some parameter would change most."""
-        evidence = self.fit.evidence
-        samples = lay_out_samples(evidence, _STRETCH_S)
+        linearisation = self.fit.linearisation
+        samples = lay_out_samples(linearisation, _STRETCH_S)
         to = self.fit.problem.to_parameters[: self.free.size] @ invert_scaled(self.normal)
         steps = ((x @ to.T, left) for x, left in self.rows)
-        band, places = evidence.band, dict[int, tuple[int, float]]()
-        first = np.cumsum([0, *map(len, evidence.residual)])
+        band, places = linearisation.band, dict[int, tuple[int, float]]()
+        first = np.cumsum([0, *map(len, linearisation.residual)])
         for here in samples:
             block, at = np.unique(here.block, return_index=True)
             trial = here.trial[at]
@@ -266,7 +271,7 @@ class SquaresFit:
 
 def fit_squares(
     trials: MeasuredTrials,
-    recipe: Recipe,
+    spec: ModelSpec,
     system: System,
     start: Array,
     block_s: float,
@@ -291,18 +296,16 @@ def fit_squares(
     at, found = begun, None
     with suppress(Runaway):
         for number in range(0 if not remove_bias else 1 if problem.linear else _PASSES):
-            again = _with_values(
-                session.fit(recipe, at, lacking=_LACKING), trials, problem, block_s
-            )
+            again = _with_values(session.fit(spec, at, lacking=_LACKING), trials, problem, block_s)
             # Replicates of a model with an error push the next fit the opposite way, so average.
-            there = again.fit.evidence.p
+            there = again.fit.linearisation.p
             at = there if found is None else 0.5 * (at + there)
             gain = again.fit.log_likelihood - found.fit.log_likelihood if found else np.inf
             found = again if gain > 0.0 else found
             if number > 1 and gain < _SETTLED:
                 break
     if found is None:
-        plain_fit = session.fit_plainly(recipe, begun)
+        plain_fit = session.fit_plainly(spec, begun)
         squares = _with_values(plain_fit, trials, problem, block_s)
         found = replace(squares, has_replicates=False)
     return found
@@ -311,7 +314,7 @@ def fit_squares(
 def _with_values(fit: Fit, trials: MeasuredTrials, problem: Problem, block_s: float) -> SquaresFit:
     """Return the fit with its parameters, including the last step of its linear problem."""
     change = (fit.problem.to_parameters @ fit.solution.base)[: problem.free.size]
-    p = np.append(fit.evidence.p, 0.0)
+    p = np.append(fit.linearisation.p, 0.0)
     p[problem.free] = np.clip(p[problem.free] + change, problem.lower, problem.upper)
     return SquaresFit(fit, trials, problem, True, p, block_s)
 
@@ -320,7 +323,7 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
     """Return the least-squares estimate; its trace is the fit to the trials up to each time."""
     motions: Sequence[Motion] = squares.trials.motions
     count = int(np.sum(squares.free < len(system.parameters)))
-    stride = -(-sum(squares.fit.evidence.sizes) // _STATES)
+    stride = -(-sum(squares.fit.linearisation.sizes) // _STATES)
     bound = 3.0 * np.median(np.concatenate([m.qd_sd[::stride] for m in motions]), axis=0)
 
     def trace() -> list[Mapping[str, object]]:
@@ -341,7 +344,7 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
             rows.append(row)
         return rows
 
-    residual = squares.fit.evidence.rmse()
+    residual = squares.fit.linearisation.rmse()
     return Estimate(
         method="least-squares",
         p=squares.p,
@@ -367,7 +370,7 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
 
 def require_enough(squares: SquaresFit, where: str) -> None:
     """Raise :class:`InputError` if there are fewer than two independent samples per parameter."""
-    samples = lay_out_samples(squares.fit.evidence, squares.block_s)
+    samples = lay_out_samples(squares.fit.linearisation, squares.block_s)
     moving = int(sum(here.independent for here in samples))
     if moving < 2 * squares.free.size:
         raise InputError(

@@ -16,9 +16,9 @@ from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import compute_added_residual
 from bampipe.diagnosis.session import Fit, Session
 from bampipe.results.next import ExpectedConfusion, join_effects
-from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import Folds
 from bampipe.trials.likelihood import Likelihood
+from bampipe.trials.linearisation import Linearisation, linearise_fit
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.samples import Noise, lay_out_samples, take_samples
@@ -147,17 +147,17 @@ class Comparison:
     @cached_property
     def sums_now(self) -> Sums:
         """The sums over the trials at hand."""
-        return self._sums_of(self.fit.evidence, self.fit.likelihood)
+        return self._sums_of(self.fit.linearisation, self.fit.likelihood)
 
     def sums(self, motions: Sequence[Motion]) -> Sums:
         """Return the sums over ``motions``, replicates of the model."""
         return reduce(add, (self._sums_of(*self._observe(motion)) for motion in motions))
 
-    def _observe(self, motion: Motion) -> tuple[Evidence, Likelihood]:
+    def _observe(self, motion: Motion) -> tuple[Linearisation, Likelihood]:
         """Return the model on a replicate, with the noise of the trials at each speed."""
-        e, c = self.fit.evidence, self.session.criteria
+        e, c = self.fit.linearisation, self.session.criteria
         name = motion.trial_id
-        seen = gather_evidence(
+        seen = linearise_fit(
             e.system, [motion], e.band, e.p, Folds.of_trials([name], (), [name]),
             most_iterations=0, timing=e.timing,
         )  # fmt: skip
@@ -179,7 +179,7 @@ class Comparison:
     @cached_property
     def _noise_by_speed(self) -> list[tuple[Array, Array, Indices]]:
         """By axis: sorted speeds of the trials, variance of replicates there, and their classes."""
-        e, likelihood, found = self.fit.evidence, self.fit.likelihood, []
+        e, likelihood, found = self.fit.linearisation, self.fit.likelihood, []
         speeds = [np.abs(m.qd[e.band.thinned_rows(len(m.t))]) for m in e.motions]
         for axis, here in enumerate(likelihood.samples):
             speed, noise = take_samples(speeds, here, axis), likelihood.noise
@@ -189,8 +189,8 @@ class Comparison:
             found.append(known if speed.size else (np.zeros(1), np.zeros(1), np.zeros(1, np.int64)))
         return found
 
-    def _sums_of(self, evidence: Evidence, likelihood: Likelihood) -> Sums:
-        e, n_q = evidence, len(likelihood.samples)
+    def _sums_of(self, linearisation: Linearisation, likelihood: Likelihood) -> Sums:
+        e, n_q = linearisation, len(likelihood.samples)
         rows = [
             np.hstack([a for r in self.alternatives for a in self._added_by(r, base)])
             for base in e.fitted
@@ -247,7 +247,7 @@ class Comparison:
     @cached_property
     def _precision(self) -> Array:
         """Prior precisions of the nuisance parameters and of the model's own."""
-        e = self.fit.evidence
+        e = self.fit.linearisation
         of_timing = [12.0 / (e.timing[1] - e.timing[0]) ** 2] if e.by_timing else []
         return np.concatenate([np.ones(2 * len(self.scale)), e.precision, of_timing])
 
@@ -345,7 +345,10 @@ class Comparison:
         sums = [self.sums([motion]) for motion in motions]
         then = [self.contrasts(self.sums_now + new, new) for new in sums]
         chances, weights = [self.confusions(found) for found in then], self.weights()
-        before, axes = self.confusions(self.contrasts_now), self.fit.evidence.system.coordinates
+        before, axes = (
+            self.confusions(self.contrasts_now),
+            self.fit.linearisation.system.coordinates,
+        )
         expected = []
         for pair in self.contrasts_now:
             left = np.median([found[pair].left for found in then], axis=0).tolist()

@@ -182,7 +182,7 @@ class Detectability:
         The latter is the median over the versions of the trial.
         """
         after = np.median([self.factors_with(motion) for motion in motions], axis=0)
-        axes = self.comparison.fit.evidence.system.coordinates
+        axes = self.comparison.fit.linearisation.system.coordinates
         return {
             one.alternative.name: Detectable(
                 parameter=one.parameter.name,
@@ -219,8 +219,8 @@ def find_detectability(
 
     ``by_chance`` are the largest gains of any candidate on each replicate, nats.
     """
-    scale, names = MachineScale.of_trials(fit.evidence), session.candidate_names(fit.recipe)
-    typical = (make_typical_alternative(item, scale) for item in candidates_of(fit.recipe, names))
+    scale, names = MachineScale.of_trials(fit.linearisation), session.candidate_names(fit.spec)
+    typical = (make_typical_alternative(item, scale) for item in candidates_of(fit.spec, names))
     alternatives = tuple(alternative for alternative in typical if alternative is not None)
     comparison = Comparison(session, fit, fit, alternatives)
     needed = find_required_gain(session.criteria, by_chance) - log_prior(
@@ -277,7 +277,7 @@ def find_jump_growth(comparison: Comparison, found: DetectionLimit) -> float:
 
     It is 0 for an effect with internal states, whose force does not jump.
     """
-    item, values, e = found.item, found.alternative.values[0], comparison.fit.evidence
+    item, values, e = found.item, found.alternative.values[0], comparison.fit.linearisation
     if item.system.memory_names != e.system.memory_names or item.replaces_motion:
         return 0.0
     axis, motion = found.axis, e.motions[0]

@@ -15,7 +15,7 @@ from bampipe.next_trial.primitives import Envelope
 from bampipe.next_trial.ranking import DesignSpace, rank_designs
 from bampipe.next_trial.rehearsal import Rehearsal
 from bampipe.phrases.proposal import say_chance
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.diagnose import DiagnoseResult, SuggestedTrial
 from bampipe.results.next import AS_FORECAST
 from bampipe.trials.linear_problem import pose_problem
@@ -53,20 +53,20 @@ def compare_alternatives(session: Session, final: Fit, odds: Odds) -> Comparison
     ``final`` is the model with its most probable set, fitted.
     """
     members = {name for one in odds for name in one}
-    recipe, e = change_effects(final.recipe, members), final.evidence
+    spec, e = change_effects(final.spec, members), final.linearisation
     known = {q.name: v for q, v in zip(e.system.parameters, e.p, strict=True)}
-    start = np.array([known[q.name] for q in system_of(recipe).parameters])
-    evidence = session.linearise(recipe, start)
-    bare = Fit(recipe, evidence, final.likelihood, pose_problem(final.likelihood, evidence))
-    others = {*session.candidate_names(recipe)} - members
+    start = np.array([known[q.name] for q in system_of(spec).parameters])
+    linearisation = session.linearise(spec, start)
+    bare = Fit(spec, linearisation, final.likelihood, pose_problem(final.likelihood, linearisation))
+    others = {*session.candidate_names(spec)} - members
     with open_search(session, bare, others) as search:
-        found = [_fit_alternative(search, recipe, *pair) for pair in odds.items()]
+        found = [_fit_alternative(search, spec, *pair) for pair in odds.items()]
     alternatives = tuple(alternative for alternative in found if alternative is not None)
     return Comparison(session, bare, final, alternatives) if len(alternatives) > 1 else None
 
 
 def _fit_alternative(
-    search: Search, recipe: Recipe, members: tuple[str, ...], odds: float
+    search: Search, spec: ModelSpec, members: tuple[str, ...], odds: float
 ) -> Alternative | None:
     """Return a set of effects with its most probable parameters; None if it explains nothing."""
     keys: tuple[Key, ...] = ()
@@ -78,7 +78,7 @@ def _fit_alternative(
     (keys,) = search.refine([keys], _REFINEMENTS)
     if not np.isfinite(search.cost(keys)):
         return None
-    wider = change_effects(recipe, (), members)
+    wider = change_effects(spec, (), members)
     pairs = zip(system_of(wider).parameters, start_of(search, keys, wider), strict=True)
     start = {q.name: value for q, value in pairs}
     items = tuple(search.dictionary.candidates[name] for name in members)
@@ -102,7 +102,7 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
     comparison = compare_alternatives(session, final, odds) if odds is not None else None
     if comparison is None:
         return None
-    trials, e = session.trials, comparison.fit.evidence
+    trials, e = session.trials, comparison.fit.linearisation
     seen = Envelope.of_trials(trials.motions, e.system, e.p)
     rehearsal = Rehearsal(e.system, e.p, trials.sensors, trials.kinematics, seen, session.seed)
 

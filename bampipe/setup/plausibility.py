@@ -14,8 +14,8 @@ from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.parameter import Parameter
-from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import Folds
+from bampipe.trials.linearisation import Linearisation, linearise_fit
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial, rms
 
@@ -94,13 +94,13 @@ def judge_setup(
     """
     with np.errstate(all="ignore"):
         try:
-            evidence = gather_evidence(
+            linearisation = linearise_fit(
                 system, motions, band, system.prior, folds, most_iterations=steps
             )
-            error = _errors_with_pose(evidence, posed) if posed else evidence.rmse()
-            on_trials = (ModelOnTrial(system, evidence.p, [motion]) for motion in motions)
+            error = _errors_with_pose(linearisation, posed) if posed else linearisation.rmse()
+            on_trials = (ModelOnTrial(system, linearisation.p, [motion]) for motion in motions)
             applied = [band.thin(on_trial.applied) for on_trial in on_trials]
-            size, used = rms(applied, evidence.used), np.concatenate(evidence.used)
+            size, used = rms(applied, linearisation.used), np.concatenate(linearisation.used)
             varied = np.std(np.concatenate(applied), axis=0, where=used)
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
@@ -110,12 +110,12 @@ def judge_setup(
         unexplained = np.where(varied > _EVEN * size, error / varied, 0.0)
     if not np.isfinite(share).all():
         return None
-    spread = CERTAIN * _standard_errors(evidence)
+    spread = CERTAIN * _standard_errors(linearisation)
     priors = np.array([item.prior for item in system.parameters])
-    nearest = np.clip(priors, evidence.p - spread, evidence.p + spread)
+    nearest = np.clip(priors, linearisation.p - spread, linearisation.p + spread)
     distance = np.array(list(map(distance_from_prior, system.parameters, nearest)))
     objections = 0.5 * np.minimum(distance**2, FARTHEST**2)
-    return Plausibility(share, moving, evidence.p, objections, unexplained)
+    return Plausibility(share, moving, linearisation.p, objections, unexplained)
 
 
 def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:
@@ -134,50 +134,52 @@ def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:
     return sorted(free)
 
 
-def _errors_with_pose(evidence: Evidence, posed: Sequence[int]) -> Array:
+def _errors_with_pose(linearisation: Linearisation, posed: Sequence[int]) -> Array:
     """Errors (n_q,) of the fit with an additional torque over position on the axes ``posed``."""
-    count = len(evidence.free)
+    count = len(linearisation.free)
     wide = np.full(4 * len(posed), np.inf)
     columns = [
-        np.concatenate([slopes, _pose_columns(evidence, k, posed)], axis=2)
-        for k, slopes in enumerate(evidence.jacobian)
+        np.concatenate([slopes, _pose_columns(linearisation, k, posed)], axis=2)
+        for k, slopes in enumerate(linearisation.jacobian)
     ]
-    root = np.sqrt(evidence.weight)[:, None]
-    fitted = evidence.folds.fitted_trials
+    root = np.sqrt(linearisation.weight)[:, None]
+    fitted = linearisation.folds.fitted_trials
     design = np.concatenate([(root * columns[k]).reshape(-1, count + wide.size) for k in fitted])
-    target = np.concatenate([(evidence.residual[k] * root[:, 0]).ravel() for k in fitted])
+    target = np.concatenate([(linearisation.residual[k] * root[:, 0]).ravel() for k in fitted])
     scale = np.maximum(np.linalg.norm(design, axis=0), np.finfo(float).tiny)
-    lower, upper = np.append(evidence.lower, -wide), np.append(evidence.upper, wide)
+    lower, upper = np.append(linearisation.lower, -wide), np.append(linearisation.upper, wide)
     step = lsq_linear(design / scale, -target, (lower * scale - 1e-12, upper * scale + 1e-12)).x
-    left = [r + c @ (step / scale) for r, c in zip(evidence.residual, columns, strict=True)]
-    used = np.maximum(np.concatenate(evidence.used).sum(axis=0), 1.0)
+    left = [r + c @ (step / scale) for r, c in zip(linearisation.residual, columns, strict=True)]
+    used = np.maximum(np.concatenate(linearisation.used).sum(axis=0), 1.0)
     return np.asarray(np.sqrt(np.sum(np.concatenate(left) ** 2, axis=0) / used))
 
 
-def _pose_columns(evidence: Evidence, trial: int, posed: Sequence[int]) -> Array:
+def _pose_columns(linearisation: Linearisation, trial: int, posed: Sequence[int]) -> Array:
     """Columns of a torque over its own position on each axis ``posed``, (K, n_q, P).
 
     They are a constant and a line, with sine and cosine for a rotary axis, or square and cube for a
     linear one.
     """
-    motion = evidence.motions[trial]
-    found = np.zeros((*evidence.residual[trial].shape, 4 * len(posed)))
+    motion = linearisation.motions[trial]
+    found = np.zeros((*linearisation.residual[trial].shape, 4 * len(posed)))
     for number, axis in enumerate(posed):
         q = motion.q[:, axis]
-        turning = evidence.system.model.device.coordinates[axis].kind == "rotary"
+        turning = linearisation.system.model.device.coordinates[axis].kind == "rotary"
         curves = (np.sin(q), np.cos(q)) if turning else (q**2, q**3)
         shapes = np.column_stack([np.ones_like(q), q, *curves])
-        thinned = evidence.band.thin(shapes, [axis] * 4) * evidence.used[trial][:, [axis]]
+        thinned = linearisation.band.thin(shapes, [axis] * 4) * linearisation.used[trial][:, [axis]]
         found[:, axis, 4 * number : 4 * number + 4] = thinned
     return found
 
 
-def _standard_errors(evidence: Evidence) -> Array:
+def _standard_errors(linearisation: Linearisation) -> Array:
     """Standard errors of the fit for independent samples, (n_p,); zero for fixed parameters."""
-    free, found = list(evidence.free), np.zeros(len(evidence.p))
-    prior_sd = np.array([evidence.system.parameters[i].sd for i in free])
+    free, found = list(linearisation.free), np.zeros(len(linearisation.p))
+    prior_sd = np.array([linearisation.system.parameters[i].sd for i in free])
     size = np.maximum(prior_sd, np.finfo(float).tiny)
-    normal = np.einsum("q,kqij->ij", evidence.weight, evidence.sums.xx) * np.outer(size, size)
+    normal = np.einsum("q,kqij->ij", linearisation.weight, linearisation.sums.xx) * np.outer(
+        size, size
+    )
     values, directions = np.linalg.eigh(normal + VAGUE**-2.0 * np.eye(len(free)))
     # Rounding may give negative information to combinations that the trials do not show.
     found[free] = size * np.sqrt(directions**2 @ (1.0 / np.maximum(values, VAGUE**-2.0)))

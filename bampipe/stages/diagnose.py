@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_spec
 from bampipe.diagnosis.candidates import list_candidates
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.description import describe
@@ -26,15 +26,15 @@ from bampipe.next_trial.suggestion import suggest_trial
 from bampipe.phrases import diagnosis as phrases
 from bampipe.physics import compile_model, registry
 from bampipe.physics.effect import effect_from
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.progress import Progress
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
 from bampipe.results.terms import EffectText
 from bampipe.schema import STRICT, Count, Distinct
-from bampipe.trials.evidence import Evidence
 from bampipe.trials.folds import HELD_OUT
+from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.measured import read_measured_trials, trial_of_block
 
 _DESCRIBED = 12
@@ -100,14 +100,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             remedy="one trial is held out to judge the others; record more free trials",
         )
     trials = replace(trials, motions=tuple(trials.motions))
-    recipe = read_recipe(run, config.model, model)
+    spec = read_spec(run, config.model, model)
     for setting in ("without", "also"):
-        _require_known(getattr(config, setting), recipe, setting)
+        _require_known(getattr(config, setting), spec, setting)
     start = read_estimate(run, config.model, system)
     jobs = config.jobs or min(8, os.cpu_count() or 1)
     session = Session(trials, config, jobs, config.seed, config.also)
     try:
-        selection = select_effects(session, recipe, start, config.without, progress)
+        selection = select_effects(session, spec, start, config.without, progress)
     except Runaway as error:
         raise NothingToDoError(
             f"model {config.model!r} cannot be diagnosed, because it cannot be simulated and so"
@@ -115,20 +115,20 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             where=str(run.root),
             remedy="judge it by validate and compare, and diagnose the model that it came from",
         ) from error
-    samples = _map_variables(selection.initial.evidence)
+    samples = _map_variables(selection.initial.linearisation)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
     progress(0.95, "looking for a trial that would decide")
-    result = _result(session, selection, recipe, config)
+    result = _result(session, selection, spec, config)
     trial = suggest_trial(session, selection.final, result)
     result = result.model_copy(update={"suggested_trial": trial})
     headline = "; ".join(f"{axis}: {phrases.verdict(result, axis)}" for axis in result.axes)
     return {"headline": headline, **_summary(result.write(out), phrases.limits(result))}
 
 
-def _require_known(names: Sequence[str], recipe: Recipe, setting: str) -> None:
+def _require_known(names: Sequence[str], spec: ModelSpec, setting: str) -> None:
     """Refuse an unknown effect, which would change nothing."""
-    extra = [effect_from(effect) for effect in recipe.extra]
-    known = list_candidates(recipe.model().device, (), extra, on_request=True)
+    extra = [effect_from(effect) for effect in spec.extra]
+    known = list_candidates(spec.model().device, (), extra, on_request=True)
     for name in names:
         if name not in known:
             raise InputError(
@@ -158,12 +158,12 @@ def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:
 
 
 def _result(
-    session: Session, selection: Selection, recipe: Recipe, config: Config
+    session: Session, selection: Selection, spec: ModelSpec, config: Config
 ) -> DiagnoseResult:
-    found, given = conclude(session, selection), selection.initial.evidence
+    found, given = conclude(session, selection), selection.initial.linearisation
     names = given.system.coordinates
     ranking = found.ranking
-    own = {effect.name: effect for effect in map(effect_from, recipe.extra)}
+    own = {effect.name: effect for effect in map(effect_from, spec.extra)}
     known = sorted({entry.effect.partition(":")[0] for entry in ranking[:_DESCRIBED]})
     maps = {}
     for i, axis in enumerate(names):
@@ -189,12 +189,12 @@ def _result(
         sentence="",
         next="",
     )
-    result = result.model_copy(update={"next": _next(result, bool(recipe.effects))})
+    result = result.model_copy(update={"next": _next(result, bool(spec.effects))})
     shapes = {}
     for i, (axis, entry) in enumerate(result.axes.items()):
         if entry.remains:
             fit = selection.final if entry.effects else selection.initial
-            shapes[axis] = describe(fit.evidence, i)
+            shapes[axis] = describe(fit.linearisation, i)
     said = phrases.describe_axes(result, shapes)
     axes = {
         axis: entry.model_copy(update={"sentence": said[axis]})
@@ -203,17 +203,17 @@ def _result(
     return result.model_copy(update={"axes": axes, "sentence": " ".join(said.values())})
 
 
-def _map_variables(evidence: Evidence) -> pd.DataFrame:
+def _map_variables(linearisation: Linearisation) -> pd.DataFrame:
     """Return map_variables.parquet: the variables of every axis' maps, sample by sample."""
-    motions, band = evidence.motions, evidence.band
+    motions, band = linearisation.motions, linearisation.band
     rows = [band.thinned_rows(len(motion.t)) for motion in motions]
     trials = [trial_of_block(motion.trial_id) for motion in motions]
     columns: dict[str, object] = {
         "trial_id": np.repeat(trials, [len(k) for k in rows]),
         "t": np.concatenate([motion.t[k] for motion, k in zip(motions, rows, strict=True)]),
     }
-    for i, axis in enumerate(evidence.system.coordinates):
-        for variable in variables(evidence.fitted, band, i):
+    for i, axis in enumerate(linearisation.system.coordinates):
+        for variable in variables(linearisation.fitted, band, i):
             columns[f"{axis}.{variable.name}"] = np.concatenate(variable.values)
     return pd.DataFrame(columns)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_spec
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.effect_file import declare
@@ -92,10 +92,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     on = f", recorded on {ingested.recorded_at[:10]}" if ingested.recorded_at else ""
     source = f"drafted by bampipe from {ingested.session_id}{on}"
     axes = [system.coordinates.index(axis) for axis in diagnosis.unnamed_axes]
-    recipe, start = read_recipe(run, config.model, model), read_estimate(run, config.model, system)
+    spec, start = read_spec(run, config.model, model), read_estimate(run, config.model, system)
     effects: dict[str, DraftedEffect] = {}
     entries: dict[str, AxisDraft] = {}
-    for one in draft_formulas(session, recipe, start, axes, source, config.curve, progress):
+    for one in draft_formulas(session, spec, start, axes, source, config.curve, progress):
         axis = system.coordinates[one.axis]
         drafted: dict[str, DraftedEffect] = {}
         named = diagnosis.axes[axis]

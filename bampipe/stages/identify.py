@@ -12,7 +12,7 @@ from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.declarations.model import read_model_file
-from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recipe
+from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_spec
 from bampipe.diagnosis.start import SignWidth, choose_sign_width, search_start
 from bampipe.errors import InputError
 from bampipe.identification.bodies import base_estimates, make_possible, summarise_bases
@@ -40,7 +40,7 @@ from bampipe.identification.least_squares_estimate import (
 )
 from bampipe.identification.sensor_noise import FilterChoice, Noise, sensor_noise
 from bampipe.physics import System, compile_model
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.progress import Progress
 from bampipe.results.identify import InputTiming
 from bampipe.results.ingest import IngestResult
@@ -98,14 +98,14 @@ class _Task:
     """A model and the trials that it is fitted to.
 
     Attributes:
-        run: the run folder; config: of the stage; recipe, system: the model.
+        run: the run folder; config: of the stage; spec, system: the model.
         width: of its smoothed sign, if the trials select a narrower one.
         trials: the trials, with the timing of their inputs free if it is estimated.
     """
 
     run: RunFolder
     config: Config
-    recipe: Recipe
+    spec: ModelSpec
     system: System
     width: SignWidth | None
     trials: MeasuredTrials
@@ -141,7 +141,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.97, "uncertainty of the calibration")
     moved = propagate_calibration(
         system,
-        task.recipe,
+        task.spec,
         run.read(IngestResult),
         read_motions(run, system, fitted=True, braked=system.braked, every_input=True),
         squares,
@@ -183,13 +183,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 def _read(run: RunFolder, config: Config) -> _Task:
     """Read the model and the trials, and choose the width of the smoothed sign on a test bench."""
     model = load_model(run, config.model, as_declared=True)
-    recipe, system = read_recipe(run, config.model, model), compile_model(model)
+    spec, system = read_spec(run, config.model, model), compile_model(model)
     motions = read_motions(run, system, fitted=True, braked=system.braked)
     require_sound_motions(system, motions)
     width = _choose_width(run, system, config)
     if width is not None:
-        recipe = recipe.with_sign_widths(width.factor)
-        system = compile_model(recipe.model())
+        spec = spec.with_sign_widths(width.factor)
+        system = compile_model(spec.model())
     names, band = trial_names(motions), read_band(run, system)
     trials = MeasuredTrials(
         motions,
@@ -200,7 +200,7 @@ def _read(run: RunFolder, config: Config) -> _Task:
         limit_s=0.5 / band.rate_hz,
         timed=config.input_timing and not system.has_free_delay,
     )
-    return _Task(run, config, recipe, system, width, trials)
+    return _Task(run, config, spec, system, width, trials)
 
 
 def _fit(task: _Task, start: Array) -> tuple[SquaresFit, InputTiming | None]:
@@ -213,7 +213,7 @@ def _fit(task: _Task, start: Array) -> tuple[SquaresFit, InputTiming | None]:
     system, trials, config = task.system, task.trials, task.config
     how = config.block_s, config.remove_bias
     try:
-        squares = fit_squares(trials, task.recipe, system, start, *how)
+        squares = fit_squares(trials, task.spec, system, start, *how)
     except ValueError as error:
         raise InputError(
             f"the free trials are too short to identify from ({error})",
@@ -230,7 +230,7 @@ def _fit(task: _Task, start: Array) -> tuple[SquaresFit, InputTiming | None]:
     late_s = float(np.clip(late_s, -trials.limit_s, trials.limit_s))
     moved = trials.with_input_timing(late_s)
     held = InputTiming(estimate=late_s, sd=sd, unit="s", limit=trials.limit_s)
-    return fit_squares(moved, task.recipe, system, squares.p[:-1], *how), held
+    return fit_squares(moved, task.spec, system, squares.p[:-1], *how), held
 
 
 def _filter(
@@ -251,7 +251,7 @@ def _filter(
         return None, why_not
     try:
         filtering = Filtering(
-            task.run, task.system, task.recipe, config.model, start, squares, by_squares.sd, noise,
+            task.run, task.system, task.spec, config.model, start, squares, by_squares.sd, noise,
             config, progress,
         )  # fmt: skip
         return estimate_by_filter(filtering), ""
@@ -314,7 +314,7 @@ def _start(task: _Task) -> Array:
         start[count:] = [np.clip(given[item.name], item.lower, item.upper) for item in own]
     else:
         trials = read_measured_trials(task.run, system, every_input=True)
-        start[count:] = search_start(trials, task.recipe)[count:]
+        start[count:] = search_start(trials, task.spec)[count:]
     free = [k for k, item in enumerate(system.parameters) if not item.fixed]
     start[free] *= task.config.start_factor
     return start
@@ -329,7 +329,7 @@ def _choose_width(run: RunFolder, system: System, config: Config) -> SignWidth |
         return None
     trials = read_measured_trials(run, system, every_input=True)
     with suppress(ValueError):  # too short: the fit itself reports it
-        found = choose_sign_width(trials, read_recipe(run, config.model, system.model))
+        found = choose_sign_width(trials, read_spec(run, config.model, system.model))
         return found if found.factor < 1.0 else None
     return None
 

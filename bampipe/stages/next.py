@@ -15,7 +15,7 @@ from bampipe.arrays import Array
 from bampipe.data.chain import read_tree
 from bampipe.data.robot_tree import identifier
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_spec
 from bampipe.declarations.recording import DRAWING
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session, change_effects, system_of
@@ -42,7 +42,7 @@ from bampipe.next_trial.trajectory import Points, list_trajectories, read_limits
 from bampipe.phrases.forecast_outcome import find_open, read_forecasts
 from bampipe.phrases.proposal import explain_proposal, find_shown, say_trajectory
 from bampipe.physics import System, compile_model
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.progress import Progress
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
@@ -113,7 +113,7 @@ class _Case:
 
     run: RunFolder
     config: Config
-    recipe: Recipe
+    spec: ModelSpec
     system: System
     p: Array
     identified: IdentifyResult
@@ -207,8 +207,8 @@ def _read_case(
     if not seen.moved_axes:
         raise InputError("no axis moves in the present trials", where=str(run.root))
     limits = read_limits(model.device, seen) if config.trajectory else {}
-    recipe = read_recipe(run, config.model, model)
-    case = _Case(run, config, recipe, system, p, found, diagnosed, session, seen, limits)
+    spec = read_spec(run, config.model, model)
+    case = _Case(run, config, spec, system, p, found, diagnosed, session, seen, limits)
     return case, purpose, parameter
 
 
@@ -238,7 +238,7 @@ def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Prog
         judged = detectability.comparison
     if judged is not None:
         # A design is followed with the model beside which effects are weighed on it.
-        system, p = judged.fit.evidence.system, judged.fit.evidence.p
+        system, p = judged.fit.linearisation.system, judged.fit.linearisation.p
     seed = case.config.seed
     rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, case.seen, seed)
     return Forecast(rehearsal, precision, comparison, detectability)
@@ -368,7 +368,7 @@ def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison 
     asked = find_ambiguity(diagnosed, case.config)
     if asked is None:
         return None
-    final = change_effects(case.recipe, (), diagnosed.selected)
+    final = change_effects(case.spec, (), diagnosed.selected)
     known = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
     known |= {q.name: value for q, value in zip(case.system.parameters, case.p, strict=True)}
     start = np.array([known.get(q.name, q.prior) for q in system_of(final).parameters])
@@ -379,7 +379,7 @@ def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison 
 def _find_detectability(case: _Case) -> Detectability:
     """Return the smallest strength of each effect that the trials show."""
     try:
-        fit = case.session.fit(case.recipe, case.p)
+        fit = case.session.fit(case.spec, case.p)
     except Runaway as error:
         raise NothingToDoError(
             "the sensitivity of these trials is not known, because the model cannot be simulated:"

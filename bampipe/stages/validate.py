@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_spec
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session
 from bampipe.errors import InputError
@@ -20,7 +20,7 @@ from bampipe.identification.terms import describe_terms
 from bampipe.lists import count_noun
 from bampipe.phrases.results import find_failed_checks
 from bampipe.physics import System, compile_model
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.progress import Progress
 from bampipe.results.floor import AT_FLOOR, compare_with_floor
 from bampipe.results.identify import IdentifyResult
@@ -92,8 +92,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         notes.append("With one trial or group, nothing is held out: the error is that of the fit.")
     floor: NoiseFloor | None = None
     if config.noise_floor:
-        recipe = read_recipe(run, config.model, model)
-        floor, said = _noise_floor(system, trials, p, recipe, config, progress)
+        spec = read_spec(run, config.model, model)
+        floor, said = _noise_floor(system, trials, p, spec, config, progress)
         notes += said
     free: FreeRun | None = None
     if config.free_run:
@@ -131,7 +131,7 @@ def _noise_floor(
     system: System,
     trials: MeasuredTrials,
     p: Array,
-    recipe: Recipe,
+    spec: ModelSpec,
     config: Config,
     progress: Progress,
 ) -> tuple[NoiseFloor | None, list[str]]:
@@ -146,7 +146,7 @@ def _noise_floor(
         chosen = draw_trials(trial_sizes(trials.motions))
     session = Session(trials.subset(chosen), Criteria(), seed=config.seed)
     try:
-        found = session.judge(recipe, p, count)
+        found = session.judge(spec, p, count)
     except InputError as error:
         return None, [f"No noise floor: simulating the fitted model failed ({error})."]
     notes = []

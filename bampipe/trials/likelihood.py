@@ -23,8 +23,8 @@ from functools import cached_property
 import numpy as np
 
 from bampipe.arrays import Array
-from bampipe.trials.evidence import Evidence
 from bampipe.trials.kept import KeptItems
+from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.samples import Noise, Samples, take_samples
 from bampipe.trials.scale import bare_slopes
 
@@ -56,14 +56,14 @@ class Likelihood:
     root: Sequence[Array]
     bias_variance: Sequence[Array]
     applied: Sequence[Array]
-    model: Evidence
+    model: Linearisation
     force_sd: Array
     discrepancy: float
 
     @classmethod
     def of(
         cls,
-        evidence: Evidence,
+        linearisation: Linearisation,
         samples: tuple[Samples, ...],
         noise: Noise,
         bias_error: float,
@@ -75,7 +75,7 @@ class Likelihood:
         Args:
             force_sd: noise of each measured force, (n_forces,), in its unit.
         """
-        e = evidence
+        e = linearisation
         axes = range(len(samples))
         applied = e.thin(lambda at: at.applied)
         turning = [np.zeros_like(r) for r in e.residual]
@@ -201,24 +201,24 @@ def _correlate(values: Array, samples: Samples, lags: int) -> Array:
     return np.asarray(total / total[0]) if total[0] > 0.0 else np.eye(1, lags + 1)[0]
 
 
-def _error_of_turning(evidence: Evidence) -> Iterator[Array]:
+def _error_of_turning(linearisation: Linearisation) -> Iterator[Array]:
     """Standard deviation of dry friction because the instants of reversals are unknown.
 
     By trial, each (T, n_q), N.m or N: the change of friction between two samples, times the
     standard deviation of an instant that is uniformly distributed between them.
     """
-    width = evidence.system.sign_widths
-    for dry, motion in zip(dry_friction(evidence), evidence.motions, strict=True):
+    width = linearisation.system.sign_widths
+    for dry, motion in zip(dry_friction(linearisation), linearisation.motions, strict=True):
         yield dry * np.gradient(np.tanh(motion.qd / width), axis=0) / np.sqrt(12.0)
 
 
-def dry_friction(evidence: Evidence) -> Iterator[Array]:
+def dry_friction(linearisation: Linearisation) -> Iterator[Array]:
     """Dry friction of a model, by trial, each (T, n_q), N.m or N.
 
     It is half the difference between slow motion in either direction, brakes included.
     """
-    slow = _SLOW * evidence.system.sign_widths
-    for at in evidence.along:
+    slow = _SLOW * linearisation.system.sign_widths
+    for at in linearisation.along:
         q, qd, qdd = at.mechanism.kinematics
         back, on = (
             at.system.residual(q, side * slow + np.zeros_like(qd), qdd, at.memory, at.inputs, at.p)

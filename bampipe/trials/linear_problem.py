@@ -11,9 +11,9 @@ import numpy as np
 
 from bampipe.arrays import Array, Flags, Indices
 from bampipe.physics.parameter import Parameter
-from bampipe.trials.evidence import Evidence
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.likelihood import Likelihood
+from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.samples import MOST_STOPPING, take_samples
 
 NOTHING = 1e-4
@@ -31,20 +31,20 @@ _STEADY = 0.02
 """Relative change of the weights at convergence; the cost changes by its square."""
 
 
-def pose_problem(likelihood: Likelihood, evidence: Evidence) -> LinearProblem:
+def pose_problem(likelihood: Likelihood, linearisation: Linearisation) -> LinearProblem:
     """Weight the residual and slopes of a linearised model, and add its priors."""
     samples, noise, weights = likelihood.samples, likelihood.noise, likelihood.root
     n_q = len(samples)
-    if evidence.factors:  # the unit is that of the measured force: small factors gain nothing
-        ratio = np.array(likelihood.model.factors) / np.array(evidence.factors)
+    if linearisation.factors:  # the unit is that of the measured force: small factors gain nothing
+        ratio = np.array(likelihood.model.factors) / np.array(linearisation.factors)
         weights = [root * by for root, by in zip(weights, ratio, strict=True)]
-    timing = evidence.timing if evidence.by_timing else ()
-    n = len(evidence.free) + len(timing[:1])
+    timing = linearisation.timing if linearisation.by_timing else ()
+    n = len(linearisation.free) + len(timing[:1])
 
     def weighted_columns(axis: int) -> Iterator[tuple[slice, Array]]:
         """Yield the columns of all unknowns, (k, n_all), in chunks, since they are large."""
         bias, stopping, weight = noise.bias[axis], noise.stopping[axis], weights[axis]
-        for part, slopes in _stack_chunks(samples[axis].take(evidence.slopes, axis)):
+        for part, slopes in _stack_chunks(samples[axis].take(linearisation.slopes, axis)):
             columns = np.zeros((len(slopes), n + 2 * n_q))
             columns[:, :n] = slopes
             columns[:, n + axis] = -bias[part]
@@ -61,24 +61,26 @@ def pose_problem(likelihood: Likelihood, evidence: Evidence) -> LinearProblem:
     # The standard deviation of a uniform distribution is 0.29 of its width.
     of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
     n_timing, none = len(of_timing), np.zeros(n_q)
-    precision = np.concatenate([evidence.precision, of_timing, none + 1.0, none + 1.0])
-    known = np.concatenate([evidence.known, np.zeros(n_timing), none + 1.0, none])
-    lower = np.concatenate([evidence.lower, timing[:1], none - np.inf, none])
-    upper = np.concatenate([evidence.upper, timing[1:], none + np.inf, none + MOST_STOPPING])
+    precision = np.concatenate([linearisation.precision, of_timing, none + 1.0, none + 1.0])
+    known = np.concatenate([linearisation.known, np.zeros(n_timing), none + 1.0, none])
+    lower = np.concatenate([linearisation.lower, timing[:1], none - np.inf, none])
+    upper = np.concatenate([linearisation.upper, timing[1:], none + np.inf, none + MOST_STOPPING])
     y = [
-        take_samples(evidence.residual, here, axis) * weights[axis]
+        take_samples(linearisation.residual, here, axis) * weights[axis]
         for axis, here in enumerate(samples)
     ]
     weight = [s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)]
     products = (w * (x.T @ x) for axis, w in enumerate(weight) for _, x in weighted_columns(axis))
     known_precision, moment = np.diag(precision), precision * known
     cost_of_known = 0.5 * float(precision @ known**2)
-    effects, p = evidence.system.model.effects, evidence.p[list(evidence.free)]
-    strengths = [_find_places(evidence, [q for q in e.parameters if q.strength]) for e in effects]
-    shapes = [_find_places(evidence, [q for q in e.parameters if q.shape]) for e in effects]
+    effects, p = linearisation.system.model.effects, linearisation.p[list(linearisation.free)]
+    strengths = [
+        _find_places(linearisation, [q for q in e.parameters if q.strength]) for e in effects
+    ]
+    shapes = [_find_places(linearisation, [q for q in e.parameters if q.shape]) for e in effects]
     if at := [place for places in strengths for place in places]:
         member = np.repeat(np.arange(len(effects)), [*map(len, strengths)])
-        own = (take_samples(evidence.slopes, here, a)[:, at] for a, here in enumerate(samples))
+        own = (take_samples(linearisation.slopes, here, a)[:, at] for a, here in enumerate(samples))
         expected = expect_strengths([x.T @ x for x in own], likelihood.applied)
         expected = expected * (member[:, None] == member)
         known_precision[np.ix_(at, at)] += expected
@@ -86,15 +88,15 @@ def pose_problem(likelihood: Likelihood, evidence: Evidence) -> LinearProblem:
         cost_of_known += 0.5 * float(p[at] @ expected @ p[at])
     normal = sum(products) + known_precision
     # Unknowns without effect over their range stay, like the shape of an effect of no strength.
-    size, parameters = np.sqrt(np.diag(normal)), evidence.system.parameters
+    size, parameters = np.sqrt(np.diag(normal)), linearisation.system.parameters
     reach = np.ones(size.size)
-    reach[: len(evidence.free)] = [parameters[i].sd or 1.0 for i in evidence.free]
+    reach[: len(linearisation.free)] = [parameters[i].sd or 1.0 for i in linearisation.free]
     per_unit = np.divide(1.0, size, out=np.zeros_like(size), where=size * reach > NOTHING)
     values, vectors = np.linalg.eigh(normal * per_unit * per_unit[:, None])
     kept = values > _DETERMINED * values[-1]
     to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
     loose = vectors[:, ~kept] * per_unit[:, None]
-    log_scale, by_parameter = _log_scale_with_filters(likelihood, evidence, y)
+    log_scale, by_parameter = _log_scale_with_filters(likelihood, linearisation, y)
     by_parameter = np.pad(by_parameter, ((0, 0), (0, 2 * n_q)))
     return LinearProblem(
         likelihood, KeptItems(y), KeptItems(map(combined_columns, range(n_q))),
@@ -106,16 +108,16 @@ def pose_problem(likelihood: Likelihood, evidence: Evidence) -> LinearProblem:
             for item, own, others in zip(effects, strengths, shapes, strict=True)
         },
         {item.name: tuple(own) for item, own in zip(effects, shapes, strict=True)},
-        cost_of_known, loose, dict.fromkeys(range(len(evidence.free), n), 0.0),
+        cost_of_known, loose, dict.fromkeys(range(len(linearisation.free), n), 0.0),
     )  # fmt: skip
 
 
 def _log_scale_with_filters(
-    likelihood: Likelihood, evidence: Evidence, y: Sequence[Array]
+    likelihood: Likelihood, linearisation: Linearisation, y: Sequence[Array]
 ) -> tuple[Array, Array]:
-    """Return `Evidence.log_scale` with the factors of the model's filters on force noise."""
-    value, slopes = (x.copy() for x in evidence.log_scale)
-    gains, by_parameter = evidence.filter_gain
+    """Return `Linearisation.log_scale` with the factors of the model's filters on force noise."""
+    value, slopes = (x.copy() for x in linearisation.log_scale)
+    gains, by_parameter = linearisation.filter_gain
     for axis in map(int, np.flatnonzero(by_parameter.any(axis=1))):
         scale = float(np.mean(y[axis] ** 2))
         rows = likelihood.log_of_filter(axis, gains[axis], scale)
@@ -125,10 +127,10 @@ def _log_scale_with_filters(
     return value, slopes
 
 
-def _find_places(evidence: Evidence, parameters: Sequence[Parameter]) -> list[int]:
+def _find_places(linearisation: Linearisation, parameters: Sequence[Parameter]) -> list[int]:
     """Indices, among the free parameters, of some parameters."""
-    names, every = {q.name for q in parameters}, evidence.system.parameters
-    return [k for k, number in enumerate(evidence.free) if every[number].name in names]
+    names, every = {q.name for q in parameters}, linearisation.system.parameters
+    return [k for k, number in enumerate(linearisation.free) if every[number].name in names]
 
 
 def _stack_chunks(parts: Iterable[Array]) -> Iterator[tuple[slice, Array]]:

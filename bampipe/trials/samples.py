@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array, Indices
-from bampipe.trials.evidence import Evidence
 from bampipe.trials.kept import KeptItems
+from bampipe.trials.linearisation import Linearisation
 
 _SPEEDS = 12
 """Classes of speed in which the variance of replicates is averaged, finer at low speeds."""
@@ -41,14 +41,14 @@ class Samples:
             yield each[rows - first, axis]
 
 
-def lay_out_samples(evidence: Evidence, block_s: float) -> tuple[Samples, ...]:
+def lay_out_samples(linearisation: Linearisation, block_s: float) -> tuple[Samples, ...]:
     """Return the samples of each axis that count, divided into blocks of ``block_s`` seconds."""
-    band, sizes = evidence.band, [len(r) for r in evidence.residual]
+    band, sizes = linearisation.band, [len(r) for r in linearisation.residual]
     trial = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
     seconds = np.concatenate([np.arange(n) * band.step / band.rate_hz for n in sizes])
     within = np.floor(seconds / block_s).astype(np.int64)
     block = np.unique(trial * (within.max() + 1) + within, return_inverse=True)[1].astype(np.int32)
-    used = np.concatenate(evidence.used)
+    used = np.concatenate(linearisation.used)
     found = []
     for axis, share in enumerate(band.independent_share):
         rows = np.flatnonzero(used[:, axis])
@@ -97,7 +97,7 @@ class Noise:
 def describe_noise(
     residuals: Sequence[Array],
     stopping: Sequence[Array],
-    evidence: Evidence,
+    linearisation: Linearisation,
     samples: Sequence[Samples],
 ) -> Noise:
     """Compute the statistics of replicates.
@@ -105,10 +105,10 @@ def describe_noise(
     Args:
         residuals: of the replicates, by trial, each (K, n_q, replicates).
         stopping: of one whose friction truly stops the axes, by trial, each (K, n_q).
-        evidence: the model on the measured trials; samples: those of it that count.
+        linearisation: the model on the measured trials; samples: those of it that count.
     """
-    thinned = evidence.band.thinned_rows
-    speeds = [np.abs(m.qd[thinned(len(m.t))]) for m in evidence.motions]
+    thinned = linearisation.band.thinned_rows
+    speeds = [np.abs(m.qd[thinned(len(m.t))]) for m in linearisation.motions]
     by_axis = KeptItems(
         np.ascontiguousarray(take_samples(residuals, here, axis).T)
         for axis, here in enumerate(samples)

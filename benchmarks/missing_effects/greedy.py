@@ -94,7 +94,7 @@ def search(session: Path, folder: Path) -> list[tuple[str, float]]:
     trials = Session(read_measured_trials(run, system, every_input=True, timing=timing), Criteria())
     recipe = read_recipe(run, "base", model)
     fit = trials.fit_plainly(recipe, read_estimate(run, "base", system))
-    e, samples = fit.evidence, fit.likelihood.samples
+    e, samples = fit.linearisation, fit.likelihood.samples
     names = trials.candidate_names(recipe)
     candidates = {c.name: c for c in candidates_of(recipe, names)}
     dictionary = Dictionary(e, samples, candidates, MachineScale.of_trials(e))

@@ -17,7 +17,7 @@ import numpy as np
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import load_model, read_estimate, read_recipe
+from bampipe.declarations.model_file import load_model, read_estimate, read_spec
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import Selection, open_search, select_effects
@@ -59,11 +59,11 @@ def identify(folder: Path, hidden: dict[str, float]) -> tuple[bampipe.Run, dict[
 def select(run: bampipe.Run) -> tuple[Selection, Search, Session]:
     """The selection of effects, with a search beside the model as given."""
     folder = RunFolder(run.root)
-    recipe = read_recipe(folder, "base", load_model(folder, "base"))
-    system, timing = system_of(recipe), folder.read(IdentifyResult, "base").input_timing
+    spec = read_spec(folder, "base", load_model(folder, "base"))
+    system, timing = system_of(spec), folder.read(IdentifyResult, "base").input_timing
     trials = read_measured_trials(folder, system, every_input=True, timing=timing)
     session = Session(replace(trials, motions=tuple(trials.motions)), Criteria())
-    found = select_effects(session, recipe, read_estimate(folder, "base", system))
+    found = select_effects(session, spec, read_estimate(folder, "base", system))
     with open_search(session, found.initial) as search:
         return found, search, session
 

@@ -6,10 +6,10 @@ import pytest
 from independent_runs import record_trials
 from sessions import take_timing_off
 
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.trials.measured import MeasuredTrials
 
-Recorded = tuple[MeasuredTrials, Recipe]
+Recorded = tuple[MeasuredTrials, ModelSpec]
 
 
 @pytest.fixture(scope="session")
@@ -21,8 +21,8 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Recorded]:
         key = (machine, seed, effects, *sorted(conditions.items()))
         if key not in known:
             root = tmp_path_factory.mktemp(machine)
-            trials, recipe, _ = record_trials(root, machine, seed, *effects, **conditions)
-            known[key] = take_timing_off(trials, recipe), recipe
+            trials, spec, _ = record_trials(root, machine, seed, *effects, **conditions)
+            known[key] = take_timing_off(trials, spec), spec
         return known[key]
 
     return recorded

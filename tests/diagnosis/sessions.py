@@ -16,10 +16,10 @@ from bampipe.diagnosis.verdict import Conclusion, conclude
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import registry
-from bampipe.physics.recipe import Recipe
-from bampipe.trials.evidence import Evidence, gather_evidence
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import AxisFilter, Kinematics
+from bampipe.trials.linearisation import Linearisation, linearise_fit
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
 from bampipe.trials.replicates import SimulatedTrials, read_by_sensors
@@ -60,43 +60,43 @@ def folds(count: int) -> Folds:
     return Folds.of_trials(names, (), names)
 
 
-def bam(effects: Sequence[str] = (), extra: Sequence[Mapping[str, Any]] = ()) -> Recipe:
+def bam(effects: Sequence[str] = (), extra: Sequence[Mapping[str, Any]] = ()) -> ModelSpec:
     """The BAM with ``effects``."""
-    return Recipe(registry.device("bam").declaration, tuple(effects), tuple(extra))
+    return ModelSpec(registry.device("bam").declaration, tuple(effects), tuple(extra))
 
 
-def fit_trials(trials: MeasuredTrials, recipe: Recipe) -> Evidence:
-    """Least squares of the model of ``recipe`` on the trials, from its priors."""
-    system = system_of(recipe)
-    return gather_evidence(system, trials.motions, trials.band, system.prior, trials.folds)
+def fit_trials(trials: MeasuredTrials, spec: ModelSpec) -> Linearisation:
+    """Least squares of the model of ``spec`` on the trials, from its priors."""
+    system = system_of(spec)
+    return linearise_fit(system, trials.motions, trials.band, system.prior, trials.folds)
 
 
-def fit_from_priors(session: Session, recipe: Recipe) -> Fit:
+def fit_from_priors(session: Session, spec: ModelSpec) -> Fit:
     """The plain fit of a model from its priors."""
-    return session.fit_plainly(recipe, system_of(recipe).prior)
+    return session.fit_plainly(spec, system_of(spec).prior)
 
 
-def take_timing_off(trials: MeasuredTrials, recipe: Recipe) -> MeasuredTrials:
+def take_timing_off(trials: MeasuredTrials, spec: ModelSpec) -> MeasuredTrials:
     """The trials with the timing of their inputs as found by least squares, and open beside it."""
     half = 0.5 / trials.band.rate_hz
     timed = replace(trials, limit_s=half, timed=True)
-    fit = fit_from_priors(Session(timed, Criteria()), recipe)
+    fit = fit_from_priors(Session(timed, Criteria()), spec)
     change = fit.problem.to_parameters @ fit.solution.base
-    return timed.with_input_timing(float(change[len(fit.evidence.free)]))
+    return timed.with_input_timing(float(change[len(fit.linearisation.free)]))
 
 
 def fit_bare(
     root: Path, machine: str, seed: int, *effects: str, replicates: int = 6
-) -> tuple[Session, Recipe, Fit]:
+) -> tuple[Session, ModelSpec, Fit]:
     """A recorded session with hidden ``effects``, the bare device, and its fit."""
-    trials, recipe, _ = record_trials(root, machine, seed, *effects)
+    trials, spec, _ = record_trials(root, machine, seed, *effects)
     trials = replace(trials, motions=tuple(trials.motions))
     session = Session(trials, Criteria(replicates=replicates))
-    return session, recipe, session.fit(recipe, system_of(recipe).prior)
+    return session, spec, session.fit(spec, system_of(spec).prior)
 
 
 def diagnose_trials(
-    trials: MeasuredTrials, recipe: Recipe, only: Sequence[str] = (), **criteria: float
+    trials: MeasuredTrials, spec: ModelSpec, only: Sequence[str] = (), **criteria: float
 ) -> tuple[Selection, Conclusion]:
     """Fit a model by least squares, as identification does, and diagnose it, in this process.
 
@@ -105,17 +105,17 @@ def diagnose_trials(
         only: effects that are weighed in place of all; criteria: other ones than the defaults.
     """
     session = Session(trials, Criteria(**criteria))
-    without = [n for n in session.candidate_names(recipe) if only and n not in only]
-    start = fit_from_priors(session, recipe).evidence.p
-    selection = select_effects(session, recipe, start, without)
+    without = [n for n in session.candidate_names(spec) if only and n not in only]
+    start = fit_from_priors(session, spec).linearisation.p
+    selection = select_effects(session, spec, start, without)
     return selection, conclude(session, selection)
 
 
 def made(
-    recipe: Recipe, values: Mapping[str, float], trials: int = 4, seconds: float = 8.0
+    spec: ModelSpec, values: Mapping[str, float], trials: int = 4, seconds: float = 8.0
 ) -> MeasuredTrials:
-    """Simulate designed motions with the model of ``recipe`` at TRUTH and ``values``."""
-    system = system_of(recipe)
+    """Simulate designed motions with the model of ``spec`` at TRUTH and ``values``."""
+    system = system_of(spec)
     known = TRUTH | {q.name: q.prior for q in system.parameters[len(TRUTH) :]} | dict(values)
     p = np.array([known[q.name] for q in system.parameters])
     rng = np.random.default_rng(7)

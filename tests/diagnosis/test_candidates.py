@@ -14,7 +14,7 @@ from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Session, acting_axes, candidates_of, system_of
 from bampipe.diagnosis.start import search_start
 from bampipe.physics import registry
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.trials.residuals import ModelOnTrial
 
 DAMPER = registry.device("magnetic_damper")
@@ -41,8 +41,8 @@ def test_gears_and_cables_are_weighed_wherever_a_motor_drives(effect):
 )
 def test_an_effect_has_the_axes_whose_equation_it_changes(effect, axes):
     for effects in ((), (effect,)):
-        recipe = Recipe(registry.device("bam").declaration, effects, ())
-        assert acting_axes(recipe, effect) == axes
+        spec = ModelSpec(registry.device("bam").declaration, effects, ())
+        assert acting_axes(spec, effect) == axes
 
 
 def test_beside_a_gear_that_loses_of_its_load_a_spring_is_scored_as_part_of_that_load():
@@ -63,10 +63,10 @@ def trials(tmp_path_factory):
 def test_what_a_candidate_adds_beside_others_is_what_the_whole_residual_changes_by(
     trials, first, second
 ):
-    recipe = Recipe(DAMPER.declaration, (first,), ())
+    spec = ModelSpec(DAMPER.declaration, (first,), ())
     session = Session(trials, Criteria())
-    base = session.linearise(recipe, search_start(trials, recipe)).fitted[0]
-    item = compile_candidate(build_candidate_model(DAMPER, second, (), recipe.effects))
+    base = session.linearise(spec, search_start(trials, spec)).fitted[0]
+    item = compile_candidate(build_candidate_model(DAMPER, second, (), spec.effects))
     p = np.concatenate([base.p, 0.3 + np.array([q.prior for q in item.parameters])])
     whole = ModelOnTrial(item.system, p, [base.motion]).residual
     added = compute_added_residual(item, p, base)
@@ -107,10 +107,10 @@ NAMED = [
 def test_the_right_effect_explains_most_and_has_the_true_size(
     tmp_path, machine, seed, effect, rivals
 ):
-    trials, recipe, truth = record_trials(tmp_path, machine, seed, effect)
+    trials, spec, truth = record_trials(tmp_path, machine, seed, effect)
     session = Session(trials, Criteria())
-    fit = fit_from_priors(session, recipe)
-    wider = replace(recipe, effects=(effect,))
+    fit = fit_from_priors(session, spec)
+    wider = replace(spec, effects=(effect,))
     with open_search(session, fit, only=(effect, *rivals)) as search:
         best = search.refine([(key,) for _, key in search.rank_additions((), 4)], 8)
         gains = {keys[0][0]: search.cost(()) - search.cost(keys) for keys in best}
@@ -121,7 +121,7 @@ def test_the_right_effect_explains_most_and_has_the_true_size(
     # The error falls to less than 0.35 of what it was, on one axis at least.
     assert gain > np.log(1.0 / 0.35) * fit.problem.independent.min()
     assert all(gain > 1.2 * other for other in gains.values())
-    for parameter in candidates_of(recipe, (effect,))[0].parameters:
+    for parameter in candidates_of(spec, (effect,))[0].parameters:
         if parameter.name in truth:
             value = found[parameter.name]
             assert value == pytest.approx(truth[parameter.name], rel=0.12), parameter.name

@@ -55,5 +55,5 @@ def test_the_declared_width_stays_where_that_is_asked_for(stopped, tmp_path):
 
 @pytest.mark.parametrize("hidden", [(), ("stribeck:piston",), ("quadratic_drag:piston",)])
 def test_a_damper_that_yields_keeps_its_width_whatever_it_lacks(tmp_path, hidden):
-    trials, recipe, _ = record_trials(tmp_path, "damper", 12202, *hidden, pace=0.3)
-    assert choose_sign_width(trials, recipe).factor == 1.0
+    trials, spec, _ = record_trials(tmp_path, "damper", 12202, *hidden, pace=0.3)
+    assert choose_sign_width(trials, spec).factor == 1.0

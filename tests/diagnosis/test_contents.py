@@ -14,25 +14,25 @@ from bampipe.diagnosis.probability import _share_explained
 from bampipe.diagnosis.session import candidates_of
 from bampipe.diagnosis.shape import _size, worst_windows
 from bampipe.physics import registry
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.floor import compare_with_floor
 from bampipe.stages.diagnose import _map_variables
 from bampipe.trials.measured import MeasuredTrials
 
 
-def bam_with_force(factor: float) -> Recipe:
+def bam_with_force(factor: float) -> ModelSpec:
     """The BAM whose applied force along the extension is ``factor`` times what the device says."""
     declaration = copy.deepcopy(dict(registry.device("bam").declaration))
     applied = dict(declaration["applied"])
     applied["extension"] = f"{factor}*({applied['extension']})"
-    return Recipe(declaration | {"applied": applied}, (), ())
+    return ModelSpec(declaration | {"applied": applied}, (), ())
 
 
-def column_size(recipe: Recipe, trials: MeasuredTrials) -> float:
+def column_size(spec: ModelSpec, trials: MeasuredTrials) -> float:
     """Size of what a wrong gain of the force along the extension adds to its equation."""
-    (item,) = candidates_of(recipe, ["force_gain:z"])
+    (item,) = candidates_of(spec, ["force_gain:z"])
     motion = trials.motions[0]
-    u, p = motion.inputs(item.system.inputs), np.append(fit_trials(trials, recipe).p, 1.0)
+    u, p = motion.inputs(item.system.inputs), np.append(fit_trials(trials, spec).p, 1.0)
     z = item.system.memory(*motion.kinematics, u, p, motion.t)
     return float(np.linalg.norm(item.system.contribution(*motion.kinematics, z, u, p)[:, 2]))
 
@@ -63,11 +63,11 @@ def test_one_judgement_of_at_the_floor(error, floor, sd, expected):
 
 def test_every_axis_has_its_worst_window_and_filters_keep_their_order():
     trials = made(bam_with_force(1.0), {}, trials=2, seconds=4.0)
-    evidence = fit_trials(trials, bam_with_force(1.0))
-    found = worst_windows(evidence, count=1)
-    assert sorted(window.axis for window in found) == sorted(evidence.system.coordinates)
+    linearisation = fit_trials(trials, bam_with_force(1.0))
+    found = worst_windows(linearisation, count=1)
+    assert sorted(window.axis for window in found) == sorted(linearisation.system.coordinates)
     for window in found:
-        alike = [w.rmse for w in worst_windows(evidence, count=1000) if w.axis == window.axis]
+        alike = [w.rmse for w in worst_windows(linearisation, count=1000) if w.axis == window.axis]
         assert window.rmse == max(alike) and len(alike) > 3
     assert tuple(KINEMATICS.axes) == ("yaw", "pitch", "extension")
     assert SENSORS.scatter_sd.tolist() == [0.0, 0.0, 0.0]

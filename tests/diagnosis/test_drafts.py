@@ -39,7 +39,7 @@ from bampipe.trials.samples import lay_out_samples
 
 def open_forms(session, fit, axis, only=None):
     """A search over the forms of the grammar, or over those whose name holds a text."""
-    forms = FormDictionary(fit.evidence, fit.likelihood.samples, axis)
+    forms = FormDictionary(fit.linearisation, fit.likelihood.samples, axis)
     forms.add_grammar()
     forms.candidates = {n: f for n, f in forms.candidates.items() if only is None or only in n}
     return FormSearch(session, fit, forms)
@@ -123,8 +123,8 @@ def test_the_same_trials_give_the_same_draft_in_several_processes(detent):
 
 
 def test_nothing_is_drafted_where_nothing_is_missing(clean):
-    session, recipe, fit = clean
-    (found,) = draft_formulas(session, recipe, fit.evidence.p, (1,), "a test")
+    session, spec, fit = clean
+    (found,) = draft_formulas(session, spec, fit.linearisation.p, (1,), "a test")
     assert found.terms == ()
     assert found.chance[0].p_value > session.criteria.largest_p_value
     assert found.chosen is found.options[0] or len(found.options) == 1
@@ -148,29 +148,29 @@ def test_a_formula_in_what_is_measured_is_told_from_chance(clean):
 def test_columns_of_forms_are_those_of_the_compiled_effects(clean, tmp_path):
     """Every shape and factor once: the grammar's text and its columns must say the same."""
     seen = set()
-    for _, recipe, fit in (clean, fit_bare(tmp_path, "damper", 6)):  # of which a coil is commanded
-        evidence = fit.evidence
-        samples = lay_out_samples(evidence, Criteria().block_s)
-        forms = FormDictionary(evidence, samples, 0)
+    for _, spec, fit in (clean, fit_bare(tmp_path, "damper", 6)):  # of which a coil is commanded
+        linearisation = fit.linearisation
+        samples = lay_out_samples(linearisation, Criteria().block_s)
+        forms = FormDictionary(linearisation, samples, 0)
         forms.add_grammar()
         for name, form in forms.candidates.items():
             if (form.shape.name, form.factor) not in seen:
                 seen.add((form.shape.name, form.factor))
-                _hold_against_effect(recipe, evidence, samples, forms, name)
+                _hold_against_effect(spec, linearisation, samples, forms, name)
 
 
-def _hold_against_effect(recipe, evidence, samples, forms, name):
+def _hold_against_effect(spec, linearisation, samples, forms, name):
     form = forms.candidates[name]
     searched = {
         constant: _between(low, high) * (2.0 if constant == "longer" else 1.0)
         for constant, (low, high, _) in form.limits().items()
     }
     atom = forms.make(forms.key(name, searched))
-    effect = replace(recipe, extra=(form.declaration("a test"),))
+    effect = replace(spec, extra=(form.declaration("a test"),))
     item = candidates_of(effect, (form.canonical_name,))[0]
     short = [q.name.rpartition(".")[2] for q in item.parameters]
     no_ranges = SimpleNamespace(range_of=lambda effect, parameter: None)
-    exact = Dictionary(evidence, samples, {name: item}, no_ranges)
+    exact = Dictionary(linearisation, samples, {name: item}, no_ranges)
     values = np.array([searched[short[i]] for i in item.searched_indices])
     exact.values = lambda key: values
     wanted = exact.make((name, ()))
@@ -230,10 +230,10 @@ def test_hysteresis_of_a_force_sensor_is_found(tmp_path):
 
 
 def test_every_form_is_an_effect_file(clean):
-    _, recipe, fit = clean
-    device = recipe.model().device
+    _, spec, fit = clean
+    device = spec.model().device
     for axis in range(3):
-        forms = FormDictionary(fit.evidence, fit.likelihood.samples, axis)
+        forms = FormDictionary(fit.linearisation, fit.likelihood.samples, axis)
         forms.add_grammar()
         for form in forms.candidates.values():
             text = toml_text(form.declaration("a test"))

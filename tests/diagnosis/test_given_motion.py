@@ -16,7 +16,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import change_set, gains_when_fitted, open_search
 from bampipe.diagnosis.session import Session, system_of
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.physics.registry import device_from
 from bampipe.trials.linear_problem import pose_problem
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
@@ -24,9 +24,9 @@ from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.scale import log_scale, slopes_by_force
 
 
-def plain_trials(trials: MeasuredTrials, recipe: Recipe) -> list[ModelOnTrial]:
+def plain_trials(trials: MeasuredTrials, spec: ModelSpec) -> list[ModelOnTrial]:
     """The model as given, at its priors, on each trial."""
-    model, motions = system_of(recipe), trials.motions
+    model, motions = system_of(spec), trials.motions
     return [ModelOnTrial(model, model.prior, motions, k) for k in range(len(motions))]
 
 
@@ -39,10 +39,10 @@ def test_delays_shorter_than_the_true_one_promise_what_they_can_at_their_bounds(
     (tmp_path / "short.toml").write_text(PIPELINE)
     pipeline = str(tmp_path / "short.toml")
     run = bampipe.run_session(tmp_path / "logs", runs=tmp_path, pipeline=pipeline, last="filter")
-    recipe = Recipe(device_from(tomllib.loads(prescribed.DEVICE)).declaration, (), ())
-    trials = read_measured_trials(RunFolder(run.root), system_of(recipe), every_input=True)
+    spec = ModelSpec(device_from(tomllib.loads(prescribed.DEVICE)).declaration, (), ())
+    trials = read_measured_trials(RunFolder(run.root), system_of(spec), every_input=True)
     session = Session(trials, Criteria())
-    fit = fit_from_priors(session, recipe)
+    fit = fit_from_priors(session, spec)
     with open_search(session, fit, only=("actuator_delay",)) as search:
         gains = search.gains(())
         shorter = [search.dictionary.values(key)[0] < 8e-3 for key in search.grid_keys]
@@ -52,36 +52,38 @@ def test_delays_shorter_than_the_true_one_promise_what_they_can_at_their_bounds(
 
 def test_a_drive_that_hardly_acts_any_more_explains_nothing(tmp_path: Path) -> None:
     """Friction that falls with the speed left nearly one force, which a drive at its limit has."""
-    trials, recipe, _ = record_trials(tmp_path, "joint", 3)
-    session, weak = Session(trials, Criteria()), change_set(recipe, [("drive_sag:joint", ())])
-    before = fit_from_priors(session, recipe)
-    p = before.evidence.p
+    trials, spec, _ = record_trials(tmp_path, "joint", 3)
+    session, weak = Session(trials, Criteria()), change_set(spec, [("drive_sag:joint", ())])
+    before = fit_from_priors(session, spec)
+    p = before.linearisation.p
     same, weaker = (
-        replace(before, recipe=weak, evidence=session.linearise(weak, np.append(p, sag)))
+        replace(before, spec=weak, linearisation=session.linearise(weak, np.append(p, sag)))
         for sag in (0.0, 1e3)
     )
     keys = (("drive_sag:joint", (0.5,)),)
-    small = replace(weaker, problem=pose_problem(before.likelihood, weaker.evidence))
+    small = replace(weaker, problem=pose_problem(before.likelihood, weaker.linearisation))
     with open_search(session, before, only=("drive_sag:joint",)) as search:
-        assert search.volume_where_fitted(keys, same.evidence) == pytest.approx([0.0])
-        assert search.volume_where_fitted(keys, weaker.evidence) is None
+        assert search.volume_where_fitted(keys, same.linearisation) == pytest.approx([0.0])
+        assert search.volume_where_fitted(keys, weaker.linearisation) is None
         assert gains_when_fitted(before, small, search, keys)[0] == -np.inf
     ends = [session.fit_plainly(weak, np.append(p, sag)) for sag in (0.0, 0.02, 1.0)]
     for end in ends:
-        assert end.evidence.p[-1] == pytest.approx(ends[0].evidence.p[-1], rel=1e-3, abs=1e-6)
+        assert end.linearisation.p[-1] == pytest.approx(
+            ends[0].linearisation.p[-1], rel=1e-3, abs=1e-6
+        )
         assert end.solution.cost <= before.solution.cost + 0.01
 
 
 def test_a_sagging_drive_leaves_the_scale_that_its_curve_has(tmp_path: Path) -> None:
     """Of d = f/(1 + sag |f|) the slope is 1/(1 + sag |f|)^2; a smooth load rounds it near zero."""
-    trials, recipe, _ = record_trials(tmp_path, "joint", 3)
-    model = system_of(change_set(recipe, [("drive_sag:joint", ())]))
-    p = np.append(system_of(recipe).prior, 0.01)
-    used = [np.abs(r.applied) > 0.5 * np.abs(r.applied).max() for r in plain_trials(trials, recipe)]
+    trials, spec, _ = record_trials(tmp_path, "joint", 3)
+    model = system_of(change_set(spec, [("drive_sag:joint", ())]))
+    p = np.append(system_of(spec).prior, 0.01)
+    used = [np.abs(r.applied) > 0.5 * np.abs(r.applied).max() for r in plain_trials(trials, spec)]
     used = [u[trials.band.thinned_rows(len(u))] for u in used]
     added = [r[..., 0] for r in slopes_by_force(model, trials.motions, trials.band, [p])]
     scale, slopes = log_scale(model, trials.motions, trials.band, used, p, [0, len(p) - 1], added)
-    applied = [np.abs(r.applied) for r in plain_trials(trials, recipe)]
+    applied = [np.abs(r.applied) for r in plain_trials(trials, spec)]
     thinned = [a[trials.band.thinned_rows(len(a))] for a in applied]
     force = np.concatenate([a[u] for a, u in zip(thinned, used, strict=True)])
     assert scale == pytest.approx([np.mean(-2.0 * np.log(1.0 + 0.01 * force))], rel=1e-3)

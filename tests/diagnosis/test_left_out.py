@@ -20,10 +20,10 @@ def test_an_estimate_moves_and_errs_as_a_fit_to_the_rest(
     values: dict[str, float], count: int
 ) -> None:
     """Up to what fresh replicates change of the weights of samples."""
-    recipe = bam(["stribeck:yaw"] if values else [])
-    system = system_of(recipe)
-    trials = made(recipe, values, trials=count, seconds=8.0 if count > 1 else 16.0)
-    fit = fit_squares(trials, recipe, system, system.prior, 2.0)
+    spec = bam(["stribeck:yaw"] if values else [])
+    system = system_of(spec)
+    trials = made(spec, values, trials=count, seconds=8.0 if count > 1 else 16.0)
+    fit = fit_squares(trials, spec, system, system.prior, 2.0)
     assert len(fit.parts) == (count if count > 1 else 12)
     step, refits, band = 1 if count > 1 else 4, [], trials.band
     for part in fit.parts[::step]:
@@ -33,10 +33,10 @@ def test_an_estimate_moves_and_errs_as_a_fit_to_the_rest(
             gone = np.abs(rest[0].t - judged[[0, -1]].mean()) < 0.5 * np.ptp(judged) + 1.0 / 8.0
             rest = [replace(rest[0], left_out=rest[0].left_out | gone[:, None])]
         others = replace(trials, motions=rest, folds=folds(len(rest)))
-        refits.append(fit_squares(others, recipe, system, fit.p[:-1], 2.0).p)
+        refits.append(fit_squares(others, spec, system, fit.p[:-1], 2.0).p)
     moved = (np.array(refits) - fit.p)[:, fit.free]
     np.testing.assert_allclose(fit.moves[::step] / fit.sd, moved / fit.sd, atol=0.5)
     if count > 1:
-        used, residual = fit.fit.evidence.used, fit.problem.residual
+        used, residual = fit.fit.linearisation.used, fit.problem.residual
         error = rms((band.thin(residual(k, p)) for k, p in enumerate(refits)), used)
         np.testing.assert_allclose(fit.held_out_rmse(fit.p), error, rtol=0.02)

@@ -19,15 +19,15 @@ pytest_plugins = ("recorded",)
 @pytest.fixture(scope="module")
 def fitted(record):
     """The arm, which lacks nothing, fitted under the likelihood."""
-    trials, recipe = record("bam", 6)
+    trials, spec = record("bam", 6)
     session = Session(trials, Criteria())
-    return session, session.fit(recipe, fit_from_priors(session, recipe).evidence.p)
+    return session, session.fit(spec, fit_from_priors(session, spec).linearisation.p)
 
 
 def factors(fit, residual):
     """Of the common bias, and of the replicate that stops, by axis, each (n_q,)."""
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
-    problem = replace(pose_problem(fit.likelihood, fit.evidence), y=y)
+    problem = replace(pose_problem(fit.likelihood, fit.linearisation), y=y)
     solved = problem.to_parameters @ problem.solve().base
     n_q = len(residual)
     return solved[-2 * n_q : -n_q], solved[-n_q:]
@@ -36,7 +36,7 @@ def factors(fit, residual):
 def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
     """Fast or slow; by replicates that the noise was not made of."""
     session, fit = fitted
-    e, samples = fit.evidence, fit.likelihood.samples
+    e, samples = fit.linearisation, fit.likelihood.samples
     nothing = [np.zeros_like(r) for r in e.residual]
     noise = describe_noise(session.replicate(e, 24), nothing, e, samples)
     fresh = replace(session, seed=1).replicate(e, 24)
@@ -53,7 +53,7 @@ def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
 
 def test_replicates_are_the_same_in_other_processes(fitted):
     session, fit = fitted
-    e = fit.evidence
+    e = fit.linearisation
     alone = session.replicate(e, 3)
     beside = replace(session, jobs=2).replicate(e, 3)
     assert len(alone) == len(e.motions)
@@ -64,8 +64,8 @@ def test_replicates_are_the_same_in_other_processes(fitted):
 def test_what_a_model_may_be_wrong_by_weighs_less_where_the_force_is_large(fitted):
     _, fit = fitted
     like = fit.likelihood
-    force_sd = np.zeros(len(fit.evidence.system.model.device.forces))
-    loose = Likelihood.of(fit.evidence, like.samples, like.noise, 1e-9, 0.05, force_sd)
+    force_sd = np.zeros(len(fit.linearisation.system.model.device.forces))
+    loose = Likelihood.of(fit.linearisation, like.samples, like.noise, 1e-9, 0.05, force_sd)
     for force, root in zip(loose.applied, loose.root, strict=True):
         large, small = np.abs(force) > np.quantile(np.abs(force), [[0.9], [0.1]])
         assert root[large].mean() < 0.6 * root[~small].mean()
@@ -194,10 +194,10 @@ def test_what_comes_back_with_the_motion_counts_as_few_independent_samples(fitte
 
 def test_a_shape_is_found_from_a_start_far_away(record):
     """Where a step promises more than it keeps, and where no strength tells the shape."""
-    trials, recipe = record("bam", 8, "stribeck:extension", creep=False)
-    wider = replace(recipe, effects=(*recipe.effects, "stribeck:extension"))
-    system, start = system_of(wider), system_of(recipe).prior
-    known = fit_squares(trials, recipe, system_of(recipe), start, 2.0).p
+    trials, spec = record("bam", 8, "stribeck:extension", creep=False)
+    wider = replace(spec, effects=(*spec.effects, "stribeck:extension"))
+    system, start = system_of(wider), system_of(spec).prior
+    known = fit_squares(trials, spec, system_of(spec), start, 2.0).p
     names = [q.name for q in system.parameters]
     for force, speed in [(3.0, 0.009), (0.0, 0.012)]:
         begun = np.array([*known[:-1], force, speed])

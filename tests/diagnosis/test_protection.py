@@ -54,14 +54,14 @@ def test_nothing_is_missing_where_nothing_was_hidden(record, machine, seed, cond
 @pytest.mark.parametrize("seconds", [pytest.param(0.3, marks=pytest.mark.long), 1.0])
 def test_one_event_decides_nothing(record, seconds):
     """Somebody pushes the drive once, for less than a block of time."""
-    trials, recipe = record("joint", 7)
+    trials, spec = record("joint", 7)
 
     def pushed(k, motion):
         force = motion.channels["current"]
         push = 0.3 * force.std() * np.exp(-(((motion.t - 4.0) / (0.5 * seconds)) ** 2))
         return {"current": force + (k == 1) * push}
 
-    _, found = diagnose_trials(moved(trials, pushed), recipe)
+    _, found = diagnose_trials(moved(trials, pushed), spec)
     assert all(p < 0.9 for p in probabilities(found).values())
     assert verdicts(found) != ["missing"]
 
@@ -69,7 +69,7 @@ def test_one_event_decides_nothing(record, seconds):
 @pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.long), False])
 @pytest.mark.parametrize("seed", [8, *(pytest.param(k, marks=pytest.mark.long) for k in (9, 10))])
 def test_a_lag_gains_nothing_by_averaging_noise(record, seed, known):
-    trials, recipe = record("joint", 4)
+    trials, spec = record("joint", 4)
     rng = np.random.default_rng(seed)
     sd = 0.5 * trials.motions[0].channels["current"].std()
 
@@ -78,7 +78,7 @@ def test_a_lag_gains_nothing_by_averaging_noise(record, seed, known):
 
     sensors = replace(trials.sensors, force_sd=np.hypot(trials.sensors.force_sd, known * sd))
     shaken = replace(moved(trials, noisy), sensors=sensors)
-    _, found = diagnose_trials(shaken, recipe)
+    _, found = diagnose_trials(shaken, spec)
     named = probabilities(found)
     assert not [n for n in named if n.partition(":")[0] in ("actuator_lag", "actuator_delay")]
 
@@ -86,24 +86,24 @@ def test_a_lag_gains_nothing_by_averaging_noise(record, seed, known):
 @pytest.mark.long
 def test_a_lag_of_two_samples_is_neither_a_delay_nor_a_flexible_load(record):
     """It leaves less of the noise of the drive as well, which alone speaks for nothing."""
-    trials, recipe = record("joint", 6, "actuator_lag:current", creep=True, rate_hz=100.0)
-    selection, found = diagnose_trials(trials, recipe)
+    trials, spec = record("joint", 6, "actuator_lag:current", creep=True, rate_hz=100.0)
+    selection, found = diagnose_trials(trials, spec)
     assert selection.effects == ("actuator_lag:current",)
     assert verdicts(found) == ["missing"]
 
 
 def test_noise_of_the_current_does_not_make_a_lag_longer(record):
-    trials, recipe = record("joint", 8, "actuator_lag:current", noise_factor=5.0)
-    lagging = replace(recipe, effects=("actuator_lag:current",))
+    trials, spec = record("joint", 8, "actuator_lag:current", noise_factor=5.0)
+    lagging = replace(spec, effects=("actuator_lag:current",))
     fit = Session(trials, Criteria(replicates=6)).fit(lagging, system_of(lagging).prior)
     (time_constant,) = fit.effect_parameters.values()
     assert time_constant == pytest.approx(0.02944, rel=0.05)
 
 
 def test_friction_by_load_beside_a_lag_does_not_halve_both_sides(record):
-    trials, recipe = record("joint", 6, "actuator_lag:current", creep=True, rate_hz=100.0)
+    trials, spec = record("joint", 6, "actuator_lag:current", creep=True, rate_hz=100.0)
     session, name = Session(trials, Criteria()), "load_dependent_presliding:joint"
-    lagging = replace(recipe, effects=("actuator_lag:current",))
+    lagging = replace(spec, effects=("actuator_lag:current",))
     fit = fit_from_priors(session, lagging)
     with open_search(session, fit, only=(name,)) as search:
         atom = search.make([(name, (0.0,))])[0][1]
@@ -114,30 +114,30 @@ def test_friction_by_load_beside_a_lag_does_not_halve_both_sides(record):
 
 def test_a_trial_that_alone_holds_a_parameter_condemns_no_model(record):
     """Its spring shows in one trial; without that nothing is known of it but what the file says."""
-    trials, recipe = record("joint", 7)
-    joint = replace(recipe, effects=("return_spring:joint",))
+    trials, spec = record("joint", 7)
+    joint = replace(spec, effects=("return_spring:joint",))
     session = Session(trials, Criteria())
-    fit = session.fit(joint, fit_from_priors(session, joint).evidence.p)
+    fit = session.fit(joint, fit_from_priors(session, joint).linearisation.p)
     residual = fit.problem.y[0] / fit.likelihood.root[0]
     assert fit.held_out_rmse[0] < 1.3 * np.sqrt(np.mean(residual**2))
 
 
 def test_inputs_that_are_read_half_a_sample_late_give_no_delay(record):
-    trials, recipe = record("joint", 5)
+    trials, spec = record("joint", 5)
     late_s = 0.4 / trials.band.rate_hz
     late = [motion.with_input_timing(-late_s) for motion in trials.motions]
-    again = take_timing_off(replace(trials, motions=tuple(late), late_s=0.0), recipe)
+    again = take_timing_off(replace(trials, motions=tuple(late), late_s=0.0), spec)
     assert again.late_s == pytest.approx(late_s, abs=3e-4)
     for some in (again, replace(trials, motions=tuple(late))):
-        _, found = diagnose_trials(some, recipe)
+        _, found = diagnose_trials(some, spec)
         assert not [n for n in probabilities(found) if "delay" in n or "lag" in n]
 
 
 def test_a_delay_that_the_timing_takes_over_only_beyond_its_bounds_has_a_size(record):
-    trials, recipe = record("joint", 5)
+    trials, spec = record("joint", 5)
     late = [m.with_input_timing(-1.0 / trials.band.rate_hz) for m in trials.motions]
     session = Session(replace(trials, motions=tuple(late)), Criteria(size=0.003))
-    fit = fit_from_priors(session, recipe)
+    fit = fit_from_priors(session, spec)
     with open_search(session, fit, only=("actuator_delay",)) as search:
         ((cost, _),) = search.rank_additions((), 1)
         assert search.cost(()) - cost > 20.0
@@ -148,9 +148,9 @@ TWIN = "other_thinning"
 
 def test_twins_are_undecided_and_their_probabilities_sum_to_one(record):
     """An effect, and a file of a user's that says the same under another name."""
-    trials, recipe = record("joint", 41, "shear_thinning:joint")
+    trials, spec = record("joint", 41, "shear_thinning:joint")
     declaration = dict(registry.effect("shear_thinning").declaration) | {"name": TWIN}
-    selection, found = diagnose_trials(trials, replace(recipe, extra=(declaration,)))
+    selection, found = diagnose_trials(trials, replace(spec, extra=(declaration,)))
     (axis,) = found.axes
     pair = {n: axis.probabilities.get(n, 0.0) for n in ("shear_thinning:joint", f"{TWIN}:joint")}
     assert axis.verdict == "undecided"
@@ -181,13 +181,13 @@ def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, eff
 
 def test_a_vibration_that_depends_on_time_alone_is_called_unknown(record):
     """Half a per cent of the force, in no state of the machine; another phase in each trial."""
-    trials, recipe = record("axis", 41)
+    trials, spec = record("axis", 41)
     motions = [
         replace(m, channels={**m.channels, "force_motor": m.channels["force_motor"] + shake})
         for k, m in enumerate(trials.motions)
         for shake in [0.35 * np.sin(2.0 * np.pi * 3.1 * m.t + k)]
     ]
-    _, found = diagnose_trials(replace(trials, motions=tuple(motions)), recipe)
+    _, found = diagnose_trials(replace(trials, motions=tuple(motions)), spec)
     (axis,) = found.axes
     assert axis.verdict == "unknown_effect" and axis.unknown > 0.9 and not found.selected
 
@@ -197,9 +197,9 @@ def test_the_numbers_that_decide_are_those_that_are_given(record):
 
     By the usual ones the effect is missing: `stages/test_diagnose.py`.
     """
-    trials, recipe = record("joint", 41, "shear_thinning:joint")
+    trials, spec = record("joint", 41, "shear_thinning:joint")
     for criteria in ({"size": 0.5}, {"probability": 0.99999}):
-        _, found = diagnose_trials(trials, recipe, **criteria)
+        _, found = diagnose_trials(trials, spec, **criteria)
         assert verdicts(found) != ["missing"]
         assert (found.selected == ()) == ("size" in criteria)
 

@@ -11,29 +11,29 @@ from independent_runs import record_trials
 from bampipe.diagnosis.session import system_of
 from bampipe.physics import Model, compile_model
 from bampipe.trials import replicates
-from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.kept import KeptItems
+from bampipe.trials.linearisation import Linearisation, linearise_fit
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.replicates import SimulatedTrials, make_replicate
 from bampipe.trials.residuals import ModelOnTrial, problem_of
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[MeasuredTrials, Evidence]:
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[MeasuredTrials, Linearisation]:
     root = tmp_path_factory.mktemp("joint")
-    trials, recipe, _ = record_trials(root, "joint", 21, trials=12, seconds=5.0)
+    trials, spec, _ = record_trials(root, "joint", 21, trials=12, seconds=5.0)
     # Every other trial: those between are moves with rests, whose errors are larger.
     trials = trials.subset(range(0, 12, 2))
-    system = system_of(recipe)
-    return trials, gather_evidence(system, trials.motions, trials.band, system.prior, trials.folds)
+    system = system_of(spec)
+    return trials, linearise_fit(system, trials.motions, trials.band, system.prior, trials.folds)
 
 
 def test_a_replicate_for_one_model_has_the_same_inputs(fitted) -> None:
-    trials, evidence = fitted
-    system = evidence.system
+    trials, linearisation = fitted
+    system = linearisation.system
     logged = {name: trials.motions[0].channels[name] for name in system.inputs}
     motion = replace(trials.motions[0], channels=logged)
-    simulated = SimulatedTrials(system, evidence.p, [motion], trials.sensors.rate_hz)
+    simulated = SimulatedTrials(system, linearisation.p, [motion], trials.sensors.rate_hz)
     rngs, course = [np.random.default_rng(3) for _ in range(2)], simulated.courses[0]
     own = make_replicate(simulated, 0, trials.sensors, trials.kinematics, rngs[0])
     recording = replicates.read_by_sensors(system, motion, *course, trials.sensors, rngs[1])
@@ -48,7 +48,7 @@ def test_a_replicate_for_one_model_has_the_same_inputs(fitted) -> None:
 def test_replicates_differ_by_noise_alone_and_share_what_was_simulated(
     fitted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    trials, evidence = fitted
+    trials, linearisation = fitted
     simulated: list[str] = []
 
     def counted(system: Any, p: Any, motion: Any, rate_hz: float) -> replicates.Course:
@@ -64,31 +64,36 @@ def test_replicates_differ_by_noise_alone_and_share_what_was_simulated(
         filters = trials.sensors, trials.kinematics
         return [make_replicate(simulated, k, *filters, rng) for k, rng in enumerate(rngs)]
 
-    one = SimulatedTrials(evidence.system, evidence.p, motions, rate_hz)
+    one = SimulatedTrials(linearisation.system, linearisation.p, motions, rate_hz)
     shared = [replicate(one, number) for number in range(2)]
     assert simulated == [motion.trial_id for motion in motions]
     for number in range(2):
-        anew = replicate(SimulatedTrials(evidence.system, evidence.p, motions, rate_hz), number)
+        anew = replicate(
+            SimulatedTrials(linearisation.system, linearisation.p, motions, rate_hz), number
+        )
         for known, again in zip(shared[number], anew, strict=True):
             np.testing.assert_array_equal(known.q, again.q)
             np.testing.assert_array_equal(
-                known.inputs(evidence.system.inputs), again.inputs(evidence.system.inputs)
+                known.inputs(linearisation.system.inputs), again.inputs(linearisation.system.inputs)
             )
     assert not np.array_equal(shared[0][0].q, shared[1][0].q)
 
 
 def test_a_replicate_leaves_out_the_moments_at_which_the_machine_stands_still(fitted) -> None:
-    trials, evidence = fitted
+    trials, linearisation = fitted
     motion = trials.motions[0]
     rest = np.zeros(motion.q.shape, dtype=bool)
     rest[200:240] = True
     simulated = SimulatedTrials(
-        evidence.system, evidence.p, [replace(motion, left_out=rest)], trials.sensors.rate_hz
+        linearisation.system,
+        linearisation.p,
+        [replace(motion, left_out=rest)],
+        trials.sensors.rate_hz,
     )
     replicate = make_replicate(
         simulated, 0, trials.sensors, trials.kinematics, np.random.default_rng(1)
     )
-    still = problem_of(evidence.system, [replicate], trials.band).standstill[0]
+    still = problem_of(linearisation.system, [replicate], trials.band).standstill[0]
     assert still[rest].all() and 0.0 < still.mean() < 0.5
     stored, _ = KeptItems([replicate, motion], most=1)
     np.testing.assert_array_equal(stored.left_out, replicate.left_out)
@@ -124,14 +129,12 @@ def test_the_jumps_of_a_drive_that_acts_or_is_read_late_are_seen(late: float) ->
 @pytest.mark.parametrize("machine", [pytest.param("axis", marks=pytest.mark.long), "joint"])
 def test_a_replicate_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tmp_path) -> None:
     """By another simulator; moved by time derivatives within the band, it was up to 27 % off."""
-    trials, recipe, _ = record_trials(
-        tmp_path, machine, 31, "actuator_delay", trials=2, seconds=5.0
-    )
-    late = replace(recipe, effects=("actuator_delay",))
+    trials, spec, _ = record_trials(tmp_path, machine, 31, "actuator_delay", trials=2, seconds=5.0)
+    late = replace(spec, effects=("actuator_delay",))
     system = system_of(late)
     start = system.prior.copy()
     start[-1] = 0.005
-    p = gather_evidence(system, trials.motions, trials.band, start, trials.folds).p
+    p = linearise_fit(system, trials.motions, trials.band, start, trials.folds).p
     simulated = SimulatedTrials(system, p, trials.motions, trials.sensors.rate_hz)
     for number, measured in enumerate(trials.motions):
         rng = np.random.default_rng(1)
@@ -154,11 +157,13 @@ def test_a_replicate_of_a_late_motor_leaves_what_the_measurement_leaves(machine,
 )
 def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values) -> None:
     """Whatever part of the force an effect takes: else the bias of replicates holds the misfit."""
-    trials, evidence = fitted
-    system = compile_model(Model(evidence.system.model.device, [effect]))
+    trials, linearisation = fitted
+    system = compile_model(Model(linearisation.system.model.device, [effect]))
     head = effect.replace(":", ".")
-    own = [values[q.name.removeprefix(f"{head}.")] for q in system.parameters[len(evidence.p) :]]
-    p = np.append(evidence.p, own)
+    own = [
+        values[q.name.removeprefix(f"{head}.")] for q in system.parameters[len(linearisation.p) :]
+    ]
+    p = np.append(linearisation.p, own)
     motion = trials.motions[0].with_channels({"stamp_offset": np.zeros(trials.motions[0].t.size)})
     measured = ModelOnTrial(system, p, [motion])
     force = replicates._required_force(measured, trials.sensors.rate_hz)
@@ -176,9 +181,9 @@ def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values
     [("force_delay", -0.006), ("actuator_delay", 0.006), ("actuator_lag:current", 0.0)],
 )
 def test_how_late_a_force_acts_is_read_off_the_model(fitted, effect, late) -> None:
-    trials, evidence = fitted
-    system = compile_model(Model(evidence.system.model.device, [effect]))
-    p = np.append(evidence.p, 0.006)
+    trials, linearisation = fitted
+    system = compile_model(Model(linearisation.system.model.device, [effect]))
+    p = np.append(linearisation.p, 0.006)
     motion = trials.motions[0]
     derivatives = {name: np.zeros(motion.t.size) for name in system.inputs}
     motion = motion.with_channels(derivatives | dict(motion.channels))

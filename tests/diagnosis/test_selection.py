@@ -35,7 +35,7 @@ def session() -> Session:
 @pytest.fixture(scope="module")
 def bare(session: Session):
     """The bare device, fitted."""
-    return session.fit(bam(), fit_from_priors(session, bam()).evidence.p)
+    return session.fit(bam(), fit_from_priors(session, bam()).linearisation.p)
 
 
 @pytest.fixture(scope="module")
@@ -113,14 +113,14 @@ def test_the_fit_starts_where_the_linear_problem_ends_and_is_the_truth(session, 
     wider = bam(EFFECTS)
     start = start_of(search, keys, wider)
     names_of = [q.name for q in system_of(wider).parameters]
-    found = dict(zip(names_of, session.fit(wider, start).evidence.p, strict=True))
+    found = dict(zip(names_of, session.fit(wider, start).linearisation.p, strict=True))
     for name, value in (TRUTH | HIDDEN).items():
         assert found[name] == pytest.approx(value, rel=0.05), name
 
 
 def test_an_effect_of_the_model_that_is_not_there_is_taken_away(session):
-    recipe = bam(("quadratic_drag:yaw",))
-    start = fit_from_priors(session, recipe).evidence.p
-    without = [n for n in session.candidate_names(recipe) if n not in (*EFFECTS, *OTHERS)]
-    found = select_effects(session, recipe, start, without)
-    assert {*found.final.recipe.effects} == {*EFFECTS}
+    spec = bam(("quadratic_drag:yaw",))
+    start = fit_from_priors(session, spec).linearisation.p
+    without = [n for n in session.candidate_names(spec) if n not in (*EFFECTS, *OTHERS)]
+    found = select_effects(session, spec, start, without)
+    assert {*found.final.spec.effects} == {*EFFECTS}

@@ -19,22 +19,22 @@ from bampipe.files import toml_text
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
     """The arm's yaw, the model fitted to it, and the same with a force that two axes shape."""
-    session, recipe, fit = fit_bare(tmp_path_factory.mktemp("arm"), "bam", 7, replicates=4)
+    session, spec, fit = fit_bare(tmp_path_factory.mktemp("arm"), "bam", 7, replicates=4)
     force = []
-    for motion, fitted in zip(fit.evidence.motions, fit.evidence.fitted, strict=True):
+    for motion, fitted in zip(fit.linearisation.motions, fit.linearisation.fitted, strict=True):
         q = fitted.mechanism.q
         column = 1.2 * np.sin(6.0 * q[:, [0]] + 9.0 * q[:, [2]])
-        band = fit.evidence.band
+        band = fit.linearisation.band
         kept = band.thinned_rows(len(motion.t))
         force.append(low_pass_at(column, band.cutoff_hz[0], band.rate_hz, kept)[:, 0])
     like = fit.likelihood
     y = list(fit.problem.y)
     y[0] = y[0] + np.concatenate(force)[like.samples[0].rows] * like.root[0]
-    return session, recipe, replace(fit, problem=replace(fit.problem, y=tuple(y)))
+    return session, spec, replace(fit, problem=replace(fit.problem, y=tuple(y)))
 
 
 def forms_of(fit):
-    return FormDictionary(fit.evidence, fit.likelihood.samples, 0)
+    return FormDictionary(fit.linearisation, fit.likelihood.samples, 0)
 
 
 @pytest.mark.parametrize(
@@ -47,9 +47,9 @@ def forms_of(fit):
     ],
 )
 def test_a_bred_expression_and_its_form_have_the_same_value(arm, text):
-    _, recipe, fit = arm
+    _, spec, fit = arm
     names = ("position", "extension velocity", "direction")
-    known = {q.words: q for q in list_quantities(recipe.model().device, 0)}
+    known = {q.words: q for q in list_quantities(spec.model().device, 0)}
     x = np.random.default_rng(1).uniform(-1.0, 1.0, (50, 3))
     parts = symbolic._read(text, 3)
     form, at = symbolic.write_form(forms_of(fit), [known[n] for n in names], list(parts))
@@ -69,7 +69,7 @@ def test_a_bred_expression_and_its_form_have_the_same_value(arm, text):
 @pytest.mark.long
 def test_what_two_axes_shape_is_found_by_symbolic_regression_alone(arm):
     pytest.importorskip("pyoperon")
-    session, recipe, fit = arm
+    session, spec, fit = arm
     forms = forms_of(fit)
     symbolic.breed(forms, fit.problem)
     bred = FormSearch(session, fit, forms)
@@ -83,7 +83,7 @@ def test_what_two_axes_shape_is_found_by_symbolic_regression_alone(arm):
     assert scale < 0.05 * bred.solve(()).scale[0]
     form = forms.candidates[best[0]]
     text = toml_text(form.declaration("a test"))
-    tried, faults = effect_faults(tomllib.loads(text), "formula", recipe.model().device)
+    tried, faults = effect_faults(tomllib.loads(text), "formula", spec.model().device)
     assert form.canonical_name in tried
     assert faults == []
     again = forms_of(fit)

@@ -83,8 +83,8 @@ def test_only_what_means_something_is_judged():
 
 def test_the_true_model_stays_close_to_an_independent_simulator(tmp_path):
     """And drifts away where a number is wrong: twice as far where a mass is wrong by 5 %."""
-    trials, recipe, truth = record_trials(tmp_path, "axis", 21)
-    system = system_of(recipe)
+    trials, spec, truth = record_trials(tmp_path, "axis", 21)
+    system = system_of(spec)
     right = np.array([truth[p.name] for p in system.parameters])
     wrong = right * np.where([p.name == "mass" for p in system.parameters], 1.05, 1.0)
     judged = [True] * len(trials.motions)

@@ -8,7 +8,7 @@ from bampipe.estimate.possible_bodies import is_possible
 from bampipe.identification.bodies import make_possible
 from bampipe.identification.least_squares_estimate import fit_squares
 from bampipe.physics import Model, compile_model
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.physics.registry import device_from
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import Kinematics
@@ -58,7 +58,7 @@ def test_a_counterbalance_that_the_model_lacks_is_not_forced_into_bodies(
         motions, Sensors(RATE, each, each, np.full(2, 0.02)), Kinematics("kalman", RATE, {}, 20.0),
         Band(RATE, (10.0, 10.0)), Folds.of_trials(names, (), names),
     )  # fmt: skip
-    fit = fit_squares(trials, Recipe(LIFT, (), ()), system, system.prior, 2.0, remove_bias=False)
+    fit = fit_squares(trials, ModelSpec(LIFT, (), ()), system, system.prior, 2.0, remove_bias=False)
     given, (note,) = make_possible(system, fit)
     places = [system.index(q.name) for q in system.model.device.robot.parameters]
     assert all(map(is_possible, given.p[places].reshape(-1, 10))) == possible

@@ -8,7 +8,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.files import write_text
 from bampipe.identification.filter_estimate import _Widths
 from bampipe.identification.sensor_noise import choose_tuning_trials
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.physics.registry import device
 from bampipe.progress import silent
 from bampipe.results.identify import IdentifyResult
@@ -23,7 +23,7 @@ effects = ["stribeck:yaw"]
 
 
 def test_widths_change_and_nothing_else() -> None:
-    plain = Recipe(device("bam").declaration, (EFFECT,), ())
+    plain = ModelSpec(device("bam").declaration, (EFFECT,), ())
     wider = plain.with_sign_widths(2.0)
     for one, other in zip(
         plain.model().device.coordinates, wider.model().device.coordinates, strict=True

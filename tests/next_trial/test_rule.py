@@ -38,11 +38,11 @@ def fit(session) -> Fit:
 
 def search_beside(fit: Fit, residual, known: Search | None = None) -> Search:
     """The search of a diagnosis over `NAMES` alone, on a residual in place of the measured one."""
-    candidates = {item.name: item for item in candidates_of(fit.recipe, NAMES)}
-    scale = MachineScale.of_trials(fit.evidence)
-    dictionary = Dictionary(fit.evidence, fit.likelihood.samples, candidates, scale)
+    candidates = {item.name: item for item in candidates_of(fit.spec, NAMES)}
+    scale = MachineScale.of_trials(fit.linearisation)
+    dictionary = Dictionary(fit.linearisation, fit.likelihood.samples, candidates, scale)
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
-    problem = replace(pose_problem(fit.likelihood, fit.evidence), y=y)
+    problem = replace(pose_problem(fit.likelihood, fit.linearisation), y=y)
     atoms = known.atoms if known is not None else {}
     return Search(
         problem, dictionary, partial(make_columns, dictionary=dictionary), CRITERIA, atoms
@@ -63,7 +63,7 @@ def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_
     detectability = find_detectability(session, fit)
     found = {one.alternative.name: one for one in detectability.limits}
     assert detectability.needed == find_required_gain(CRITERIA, ()) - log_prior(
-        CRITERIA, len(session.candidate_names(fit.recipe))
+        CRITERIA, len(session.candidate_names(fit.spec))
     )
     noise, scale = fit.likelihood.noise, detectability.comparison.scale
     plain = search_beside(fit, noise.bias)
@@ -126,10 +126,10 @@ def test_rivals_are_the_effects_in_which_the_most_probable_sets_differ():
 
 def test_a_trial_is_suggested_that_tells_apart_what_small_motion_does_not():
     values = {"quadratic_drag.yaw.coefficient": 0.6}
-    recipe = bam(["quadratic_drag:yaw"])
-    trials = made(recipe, values, trials=2, seconds=6.0)
+    spec = bam(["quadratic_drag:yaw"])
+    trials = made(spec, values, trials=2, seconds=6.0)
     session = Session(trials, CRITERIA)
-    final = session.fit(recipe, np.array([*TRUTH.values(), 0.6]))
+    final = session.fit(spec, np.array([*TRUTH.values(), 0.6]))
     asked = made_diagnosis([(("quadratic_drag:yaw",), 0.6), (("stribeck:yaw",), 0.4)])
     comparison = compare_alternatives(session, final, find_ambiguity(asked, CRITERIA))
     assert [alternative.name for alternative in comparison.alternatives] == [
@@ -156,14 +156,14 @@ def test_where_both_alternatives_fit_badly_a_trial_tells_no_more_than_the_diagno
     session, distances = Session(trials, CRITERIA), []
     asked = made_diagnosis([(("quadratic_drag:yaw",), 0.6), (("stribeck:yaw",), 0.4)])
     for more in ((), ("return_spring:yaw",)):
-        recipe = bam(["quadratic_drag:yaw", *more])
-        start = [(TRUTH | values).get(q.name, q.prior) for q in system_of(recipe).parameters]
-        final = session.fit(recipe, np.array(start))
+        spec = bam(["quadratic_drag:yaw", *more])
+        start = [(TRUTH | values).get(q.name, q.prior) for q in system_of(spec).parameters]
+        final = session.fit(spec, np.array(start))
         comparison = compare_alternatives(session, final, find_ambiguity(asked, CRITERIA))
         counted = [here.independent for here in final.count_independent(CRITERIA)]
         assert comparison.sums_now.independent == pytest.approx(counted)
         # A new trial is counted as those at hand are.
-        again = comparison.sums(final.evidence.motions)
+        again = comparison.sums(final.linearisation.motions)
         assert again.independent == pytest.approx(counted)
         distances.append((comparison.contrasts_now[0, 1].distance, comparison.scale[0], counted[0]))
     (distance, scale, count), (complete, scale_then, count_then) = distances

@@ -8,16 +8,16 @@ from independent_runs import record_run
 import bampipe
 from bampipe.errors import InputError
 from bampipe.physics import registry
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.stages.diagnose import _require_known
 
 
 def test_what_is_no_effect_cannot_be_left_out() -> None:
-    recipe = Recipe(registry.device("slider").declaration, (), ())
-    _require_known(("stribeck:carriage",), recipe, "without")
+    spec = ModelSpec(registry.device("slider").declaration, (), ())
+    _require_known(("stribeck:carriage",), spec, "without")
     with pytest.raises(InputError, match=r"has no effect 'stribek:.*', did you mean 'stribeck:"):
-        _require_known(("stribek:carriage",), recipe, "also")
+        _require_known(("stribek:carriage",), spec, "also")
 
 
 @pytest.fixture(scope="module")

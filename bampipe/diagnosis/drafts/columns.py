@@ -26,7 +26,7 @@ from bampipe.diagnosis.drafts.forms import (
 )
 from bampipe.diagnosis.drafts.shapes import SHAPES
 from bampipe.estimate.low_pass import low_pass_at
-from bampipe.trials.evidence import Evidence
+from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.samples import Samples
 
 _FINER = 5
@@ -52,13 +52,13 @@ class FormDictionary:
     """The forms that may act on one axis, beside one fitted model.
 
     Attributes:
-        samples: samples of the evidence that count; axis: index of the coordinate.
+        samples: samples of the residual that count; axis: index of the coordinate.
         candidates: forms by name.
         starts: initial constants of candidates without a grid.
     """
 
-    def __init__(self, evidence: Evidence, samples: Sequence[Samples], axis: int) -> None:
-        self.evidence, self.samples, self.axis = evidence, samples, axis
+    def __init__(self, linearisation: Linearisation, samples: Sequence[Samples], axis: int) -> None:
+        self.linearisation, self.samples, self.axis = linearisation, samples, axis
         self.candidates: dict[str, Form] = {}
         self.starts: dict[str, Mapping[str, float]] = {}
 
@@ -70,7 +70,7 @@ class FormDictionary:
         spans = self.spans
         if left is not None:
             spans = {n: self._where_left(n, span, left) for n, span in spans.items()}
-        device = self.evidence.system.model.device
+        device = self.linearisation.system.model.device
         for quantity in list_quantities(device, self.axis):
             if quantity.words not in spans:
                 continue  # it does not vary
@@ -146,7 +146,7 @@ class FormDictionary:
                         np.gradient(values, axis=0) * self._rate_hz * self._signals[DAMPING][i]
                     )
                     acting = -acting - (0.5 if form.is_own else 1.0) * turning / form.scale
-                cutoff = float(self.evidence.band.cutoff_hz[axis])
+                cutoff = float(self.linearisation.band.cutoff_hz[axis])
                 rows[axis].append(low_pass_at(acting, cutoff, self._rate_hz, kept))
                 if form.coordinate.quantity in (_LOAD, READING):
                     slope = _slopes(values, x[:, 0])[kept] * lever[kept]
@@ -163,7 +163,7 @@ class FormDictionary:
 
     def thin(self, words: str) -> Array:
         """Return a quantity, low-passed like the residual and at its samples, (n,)."""
-        cutoff = float(self.evidence.band.cutoff_hz[self.axis])
+        cutoff = float(self.linearisation.band.cutoff_hz[self.axis])
         found = [
             low_pass_at(signal, cutoff, self._rate_hz, kept)[:, 0]
             for signal, (_, kept) in zip(self._signals[words], self._sampling, strict=True)
@@ -182,11 +182,11 @@ class FormDictionary:
     @cached_property
     def _sampling(self) -> list[tuple[slice, Indices]]:
         """Samples at which columns are computed, and which of them are kept, by trial."""
-        band = self.evidence.band
+        band = self.linearisation.band
         fits = [d for d in range(1, band.step + 1) if band.step % d == 0]
         every = max(d for d in fits if d * _FINER <= band.step or d == 1)
         found = []
-        for motion in self.evidence.motions:
+        for motion in self.linearisation.motions:
             kept = band.thinned_rows(len(motion.t))
             first = int(kept[0]) % every if len(kept) else 0
             found.append((slice(first, None, every), (kept - first) // every))
@@ -201,12 +201,12 @@ class FormDictionary:
 
     @property
     def _rate_hz(self) -> float:
-        return float(self.evidence.band.rate_hz / self._sampling[0][0].step)
+        return float(self.linearisation.band.rate_hz / self._sampling[0][0].step)
 
     @cached_property
     def _signals(self) -> dict[str, list[Array]]:
         """Quantities by their words, and velocity and acceleration of the axis, each (T, 1)."""
-        e, axis = self.evidence, self.axis
+        e, axis = self.linearisation, self.axis
         system, device = e.system, e.system.model.device
         found: dict[str, list[Array]] = {}
         for fitted, (rows, _) in zip(e.fitted, self._sampling, strict=True):
@@ -235,7 +235,7 @@ class FormDictionary:
     @cached_property
     def _pulls(self) -> list[Array]:
         """Force on each axis by each measured force, by trial, (T, n_q, n_forces)."""
-        e, found = self.evidence, []
+        e, found = self.linearisation, []
         for fitted, (rows, _) in zip(e.fitted, self._sampling, strict=True):
             motion = fitted.mechanism
             u = motion.inputs(e.system.inputs)[rows]
@@ -245,13 +245,13 @@ class FormDictionary:
     def _lever(self, form: Form, axis: int, trial: int) -> Array:
         """Return the factor on the shape of a form on an axis, (T, 1)."""
         if form.factor == READING:
-            component = self.evidence.system.model.device.forces.index(form.coordinate.channel)
+            component = self.linearisation.system.model.device.forces.index(form.coordinate.channel)
             return -self._pulls[trial][:, axis, [component]]
         return np.ones((1, 1)) if form.factor == FORCE else self._signals[form.factor][trial]
 
     def _by_forces(self, form: Form, trial: int, kept: Indices) -> Array:
         """Return the slope of a form's quantity by the measured forces, (K, n_forces, 1)."""
-        forces = self.evidence.system.model.device.forces
+        forces = self.linearisation.system.model.device.forces
         if form.factor == READING:
             return np.array([[[float(f == form.coordinate.channel)] for f in forces]])
         pulls, applied = self._pulls[trial][kept, self.axis], self._signals[_APPLIED][trial][kept]
@@ -260,7 +260,9 @@ class FormDictionary:
     @cached_property
     def spans(self) -> dict[str, Span]:
         """The range of each quantity that varies."""
-        words = [c.words for c in list_quantities(self.evidence.system.model.device, self.axis)]
+        words = [
+            c.words for c in list_quantities(self.linearisation.system.model.device, self.axis)
+        ]
         ends = {n: np.quantile(np.concatenate(self._signals[n]), _RANGE) for n in words}
         return {n: Span(float(a), float(b)) for n, (a, b) in ends.items() if b - a > 1e-9}
 
@@ -276,7 +278,7 @@ class FormDictionary:
     @cached_property
     def times(self) -> Span:
         """Time between samples and of a trial, s."""
-        trials = [motion.t for motion in self.evidence.motions]
+        trials = [motion.t for motion in self.linearisation.motions]
         return Span(float(np.median(np.diff(trials[0]))), max(float(np.ptp(t)) for t in trials))
 
     def _points(self, form: Form) -> list[dict[str, float]]:
@@ -284,7 +286,7 @@ class FormDictionary:
         span, names = form.span, tuple(form.shape.searched)
         lengths, most = span.width * np.geomspace(*_LENGTHS), _MOST_WAVES
         if form.coordinate.quantity == "time":
-            cutoff = float(self.evidence.band.cutoff_hz[self.axis])
+            cutoff = float(self.linearisation.band.cutoff_hz[self.axis])
             most = min(span.width * cutoff, _MOST_WAVES_IN_TIME)
         waves = [*_PARTS_OF_A_WAVE, *np.arange(1.0, max(most, 2.0), _WAVES_APART)]
         grids: dict[tuple[str, ...], Iterable[Sequence[float]]] = {

@@ -23,7 +23,7 @@ from bampipe.diagnosis.probability import compute_p_value
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import TASKS_PER_PROCESS, Progress, make_columns, start_at
 from bampipe.diagnosis.session import Fit, Session, worker_state, workers
-from bampipe.physics.recipe import Recipe
+from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.draft import ChanceOfDraft
 
 MOST_TERMS = 2
@@ -78,13 +78,13 @@ class Option:
     Attributes:
         held_out_rmse: held-out error of the axis, N.m or N.
         log_evidence: log evidence over the given model, nats.
-        recipe: the model; p: its parameters, (n_p,).
+        spec: the model; p: its parameters, (n_p,).
     """
 
     terms: tuple[Form, ...]
     held_out_rmse: float
     log_evidence: float
-    recipe: Recipe
+    spec: ModelSpec
     p: Array
 
     @property
@@ -162,7 +162,7 @@ def _refine(key: Key) -> Key:
 
 def draft_formulas(
     session: Session,
-    recipe: Recipe,
+    spec: ModelSpec,
     start: Array,
     axes: Sequence[int],
     source: str,
@@ -181,13 +181,13 @@ def draft_formulas(
     """
     found: list[FoundDraft] = []
     for k, axis in enumerate(axes):
-        name = recipe.model().device.coordinates[axis].name
+        name = spec.model().device.coordinates[axis].name
 
         def tell(fraction: float, message: str, k: int = k, name: str = name) -> None:
             progress((k + fraction) / len(axes), f"{name}: {message}")
 
-        found.append(_AxisSearch(session, axis, source, curves).run(recipe, start, tell))
-        recipe, start = found[-1].chosen.recipe, found[-1].chosen.p
+        found.append(_AxisSearch(session, axis, source, curves).run(spec, start, tell))
+        spec, start = found[-1].chosen.spec, found[-1].chosen.p
     return found
 
 
@@ -200,10 +200,10 @@ class _AxisSearch:
     source: str
     curves: bool
 
-    def run(self, recipe: Recipe, start: Array, progress: Progress) -> FoundDraft:
+    def run(self, spec: ModelSpec, start: Array, progress: Progress) -> FoundDraft:
         """Add terms to a model while one gains more than chance and lowers the held-out error."""
-        bare, least = self.session.fit(recipe, start), self.session.criteria.largest_p_value
-        given = Option((), self._error_of(bare), 0.0, recipe, bare.evidence.p)
+        bare, least = self.session.fit(spec, start), self.session.criteria.largest_p_value
+        given = Option((), self._error_of(bare), 0.0, spec, bare.linearisation.p)
         options, chances, stand = [given], [], (bare, given)
         for number in range(MOST_TERMS):
             progress(0.05 + 0.4 * number, "comparing every form with the residual")
@@ -226,7 +226,7 @@ class _AxisSearch:
             options += tried
             stand = self._take(stand, tried)
         fit, chosen = stand
-        chosen = replace(chosen, held_out_rmse=self._error_of(fit), p=fit.evidence.p)
+        chosen = replace(chosen, held_out_rmse=self._error_of(fit), p=fit.linearisation.p)
         options = [chosen if o.terms == chosen.terms else o for o in options]
         return FoundDraft(
             self.axis, _terms(fit, chosen), tuple(chances),
@@ -240,7 +240,7 @@ class _AxisSearch:
 
     def _open(self, fit: Fit, bred: bool = False) -> FormSearch:
         """Open a search over the forms of the grammar, or over ``bred`` formulas."""
-        forms = FormDictionary(fit.evidence, fit.likelihood.samples, self.axis)
+        forms = FormDictionary(fit.linearisation, fit.likelihood.samples, self.axis)
         if bred:
             symbolic.breed(forms, fit.problem)
         else:
@@ -255,7 +255,7 @@ class _AxisSearch:
         best = max((chosen, *lower), key=lambda option: option.log_evidence)
         if best is chosen:
             return stand
-        return self.session.fit(best.recipe, best.p), best
+        return self.session.fit(best.spec, best.p), best
 
     def _fit_forms(self, search: FormSearch, current: Option) -> list[Option]:
         """Fit the model with each of the best forms, all parameters together."""
@@ -266,9 +266,9 @@ class _AxisSearch:
             if form.name in [one.name for one in current.terms]:
                 form = replace(form, prefix="other_")
             wider = replace(
-                current.recipe,
-                effects=(*current.recipe.effects, form.canonical_name),
-                extra=(*current.recipe.extra, form.declaration(self.source)),
+                current.spec,
+                effects=(*current.spec.effects, form.canonical_name),
+                extra=(*current.spec.extra, form.declaration(self.source)),
             )
             strengths = dict(zip(form.shape.strengths, solution.strengths[0], strict=True))
             values = search.forms.values(key) | strengths
@@ -288,11 +288,11 @@ class _AxisSearch:
         return found
 
 
-def _fit_form(task: tuple[Recipe, Array]) -> tuple[float, float, Array]:
+def _fit_form(task: tuple[ModelSpec, Array]) -> tuple[float, float, Array]:
     """Return cost, held-out error and parameters of the fit of a model with a form."""
     search, noise = worker_state()
     fit = search.session.fit(*task, noise)
-    return fit.solution.cost, float(fit.held_out_rmse[search.axis]), fit.evidence.p
+    return fit.solution.cost, float(fit.held_out_rmse[search.axis]), fit.linearisation.p
 
 
 def weigh_chance(search: FormSearch) -> ChanceOfDraft:
@@ -303,7 +303,7 @@ def weigh_chance(search: FormSearch) -> ChanceOfDraft:
 
 def _terms(fit: Fit, option: Option) -> tuple[Term, ...]:
     """Return the terms of a fitted model with values and covariance, all parameters free."""
-    e, p = fit.evidence, fit.problem
+    e, p = fit.linearisation, fit.problem
     solved = p.solve()
     normal = np.tensordot(solved.weight, p.sums()[0], 1) + p.precision
     covariance = p.to_parameters @ np.linalg.pinv(normal, hermitian=True) @ p.to_parameters.T

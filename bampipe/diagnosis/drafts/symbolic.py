@@ -47,7 +47,7 @@ def is_available() -> bool:
 
 def breed(forms: FormDictionary, problem: LinearProblem) -> None:
     """Add formulas for the residual of ``problem`` on the axis of ``forms``."""
-    device, axis = forms.evidence.system.model.device, forms.axis
+    device, axis = forms.linearisation.system.model.device, forms.axis
     known = [
         q
         for q in list_quantities(device, axis)
@@ -154,6 +154,6 @@ def write_form(
         tuple(fixed), "follows a formula in {x}",
     )  # fmt: skip
     (first, span), *beside = ((q, forms.spans[q.words]) for q in chosen)
-    axis = forms.evidence.system.model.device.coordinates[forms.axis]
+    axis = forms.linearisation.system.model.device.coordinates[forms.axis]
     form = Form(axis, forms.axis, FORCE, shape, first, span, forms.times, 1.0, tuple(beside))
     return form, {str(name): float(n) for n, name in names.items()}

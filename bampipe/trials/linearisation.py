@@ -39,7 +39,7 @@ _STEP = 0.01
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Linearisation:
     """Residuals of one model on the trials of one session, linearised at its least-squares fit.
 
     Attributes:
@@ -81,7 +81,7 @@ class Evidence:
     def slopes(self) -> Iterable[Array]:
         """By trial, `jacobian`, followed by the column `by_timing` if the delay is fitted.
 
-        They are joined on each access: stored, they would double the memory of an `Evidence`.
+        They are joined on each access: stored, they would double the memory of an `Linearisation`.
         """
         if not self.by_timing:
             return self.jacobian
@@ -190,7 +190,7 @@ class Evidence:
         return rms(self.residual, self.used)
 
 
-def gather_evidence(
+def linearise_fit(
     system: System,
     motions: Sequence[Motion],
     band: Band,
@@ -198,9 +198,9 @@ def gather_evidence(
     folds: Folds,
     *,
     most_iterations: int = 12,
-    like: Evidence | None = None,
+    like: Linearisation | None = None,
     timing: tuple[float, float] = (0.0, 0.0),
-) -> Evidence:
+) -> Linearisation:
     """Fit a model to the fitted trials, from parameters (n_p,), and linearise it on all trials.
 
     ``like`` is a fitted model with more or fewer effects, whose slopes are reused where both agree;
@@ -234,7 +234,7 @@ def gather_evidence(
             used.extend(np.split(s.used, parts))
             yield from np.split(s.slope, parts)
 
-    return Evidence(
+    return Linearisation(
         system, found.p[:-1], motions, joined, band, folds, residual, KeptItems(slopes()), used,
         tuple(int(i) for i in problem.free),
         problem.lower - value, problem.upper - value, problem.precision, problem.known - value,
@@ -243,7 +243,7 @@ def gather_evidence(
 
 
 def _factors(problem: Problem, p: Array, axes: int) -> tuple[float, ...]:
-    """Absolute values of the parameters that multiply the forces, see `Evidence.factors`."""
+    """Absolute values of the parameters that multiply the forces, see `Linearisation.factors`."""
     if problem.multiplied is None:
         return ()
     found = np.ones(axes)
@@ -257,7 +257,7 @@ def _on_each(system: System, p: Array, motions: Sequence[Motion]) -> tuple[Model
     return tuple(ModelOnTrial(system, p, motions, k) for k in range(len(motions)))
 
 
-def _common_slopes(like: Evidence, system: System, problem: Problem) -> KnownSlopes | None:
+def _common_slopes(like: Linearisation, system: System, problem: Problem) -> KnownSlopes | None:
     """The slopes by shared parameters that are the same in both models.
 
     A slope that depends on no parameter is the same with and without any effect. None are shared if

@@ -14,7 +14,7 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.physics.registry import device_from
-from bampipe.trials.evidence import gather_evidence
+from bampipe.trials.linearisation import linearise_fit
 from bampipe.trials.motion import Motion, Recording
 from bampipe.trials.residuals import problem_of
 
@@ -36,11 +36,11 @@ def test_thinning_is_that_of_the_library_with_a_cut_off_an_axis():
 
 def test_slopes_are_those_of_the_last_parameters_after_a_nonlinear_fit():
     """Slopes that no parameter changes are carried from one iteration to the next."""
-    recipe = bam(["presliding:yaw"])
-    session = made(recipe, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=2)
-    system, found = system_of(recipe), fit_trials(session, recipe)
+    spec = bam(["presliding:yaw"])
+    session = made(spec, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=2)
+    system, found = system_of(spec), fit_trials(session, spec)
     assert np.abs(found.p - system.prior).max() > 0.2
-    anew = gather_evidence(system, session.motions, BAND, found.p, session.folds, most_iterations=0)
+    anew = linearise_fit(system, session.motions, BAND, found.p, session.folds, most_iterations=0)
     for carried, fresh in zip(found.jacobian, anew.jacobian, strict=True):
         np.testing.assert_allclose(carried, fresh, rtol=1e-6, atol=1e-9)
 
@@ -48,9 +48,9 @@ def test_slopes_are_those_of_the_last_parameters_after_a_nonlinear_fit():
 @pytest.mark.parametrize("timing", [False, True])
 def test_slopes_that_are_called_constant_are_the_same_at_other_parameters(timing):
     """With the inputs moved in time, too, where their timing is estimated."""
-    recipe = bam(["presliding:yaw", "force_gain:x"])
-    session = made(recipe, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=1)
-    system = system_of(recipe)
+    spec = bam(["presliding:yaw", "force_gain:x"])
+    session = made(spec, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=1)
+    system = system_of(spec)
     problem = problem_of(system, session.motions, BAND, timing=timing)
     here, there = np.append(system.prior, 0.0), np.append(1.3 * system.prior, 0.0)
     there[-1] = 0.4 / RATE if timing else 0.0
@@ -65,10 +65,10 @@ def test_slopes_that_are_called_constant_are_the_same_at_other_parameters(timing
 def test_a_fit_that_takes_slopes_from_a_model_like_it_is_the_same(effects):
     session = made(bam(), {}, trials=2)
     narrow, wide = system_of(bam()), system_of(bam(effects))
-    fits = [fit_trials(session, recipe) for recipe in (bam(effects), bam())]
+    fits = [fit_trials(session, spec) for spec in (bam(effects), bam())]
     for system, alone, like in zip((wide, narrow), fits, fits[::-1], strict=True):
         given = system, session.motions, BAND, system.prior, session.folds
-        found = gather_evidence(*given, like=like)
+        found = linearise_fit(*given, like=like)
         for one, two in zip(found.jacobian, alone.jacobian, strict=True):
             np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-7 * np.abs(two).max())
 
@@ -82,7 +82,7 @@ def test_standstill_is_left_out_and_quick_reversals_stay():
     system = system_of(bam())
     channels = {name: np.zeros(2000) for name in system.inputs}
     motion = Motion("t01", t, qd, qd, 0.0 * qd, np.full_like(qd, 1e-3), channels)
-    used = gather_evidence(system, [motion], BAND, system.prior, folds(1)).used[0]
+    used = linearise_fit(system, [motion], BAND, system.prior, folds(1)).used[0]
     rows = t[BAND.thinned_rows(2000)]
     assert used[:, 0].all() and used[:, 2].all()
     assert not used[(rows > 3.1) & (rows < 3.9), 1].any()

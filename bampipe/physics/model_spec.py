@@ -15,7 +15,7 @@ from bampipe.physics.registry import device_from, effect_from
 
 
 @dataclass(frozen=True)
-class Recipe:
+class ModelSpec:
     """A model as plain data, so that a worker process can build it again.
 
     Attributes:
@@ -28,7 +28,7 @@ class Recipe:
     effects: tuple[str, ...]
     extra: tuple[Mapping[str, Any], ...]
 
-    def with_sign_widths(self, factor: float) -> Recipe:
+    def with_sign_widths(self, factor: float) -> ModelSpec:
         """Return the model with signs of velocities smoothed over ``factor`` times the width."""
         declaration = deepcopy(dict(self.device))
         for coordinate in device_from(self.device).coordinates:
