@@ -92,9 +92,9 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     given = table.get("limits")
     if isinstance(given, Mapping):
         # A joint's own table adds to what is drawn of it.
-        drawn = filled["limits"]
-        filled["limits"] = drawn | {
-            joint: {**drawn.get(joint, {}), **own} if isinstance(own, Mapping) else own
+        of_joints = filled["limits"]
+        filled["limits"] = of_joints | {
+            joint: {**of_joints.get(joint, {}), **own} if isinstance(own, Mapping) else own
             for joint, own in given.items()
         }
         table = {key: value for key, value in table.items() if key != "limits"}

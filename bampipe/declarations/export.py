@@ -80,43 +80,43 @@ def _json(run: RunFolder, name: str, system: System, p: Array) -> str:
 
 
 def _urdf(run: RunFolder, system: System, p: Array) -> str:
-    drawn, robot = _drawn(run, system, p), _robot(run, system)
+    tree, robot = _identify_tree(run, system, p), _robot(run, system)
     drives = _drive_inertia(system, p)
     shown = ", ".join(
         f"{joint} {own:.6g}" for joint, own in zip(system.coordinates, np.diag(drives), strict=True)
     )
     lacks = [f"drives' inertia at their joints, kg.m2 or kg ({shown})"] if drives.any() else []
-    said = gravity_at(drawn.before, drawn.base)[0] if drawn.urdf is not None else None
+    said = gravity_at(tree.before, tree.base)[0] if tree.urdf is not None else None
     if not np.allclose(robot.gravity, said or UPRIGHT):
-        lacks.append(f"gravity in the frame of {drawn.base} ({number_list(robot.gravity)})")
+        lacks.append(f"gravity in the frame of {tree.base} ({number_list(robot.gravity)})")
     # Motors that move several joints couple them, which a URDF cannot express.
     if np.any(drives != np.diag(np.diag(drives))):
         lacks.append("inertia by which drives couple joints")
     if shared := [name for name, motor in robot.motors.items() if len(motor.turns) > 1]:
         lacks.append(f"friction of motors of several joints ({', '.join(shared)})")
-    comment = _head(drawn, [*lacks, *(item.name for item in system.model.effects)])
-    if drawn.urdf is not None:
-        return changed_urdf(drawn.urdf, drawn.before, drawn.after, comment)
-    return urdf_text(system.model.device.name, drawn.flat, comment)
+    comment = _head(tree, [*lacks, *(item.name for item in system.model.effects)])
+    if tree.urdf is not None:
+        return changed_urdf(tree.urdf, tree.before, tree.after, comment)
+    return urdf_text(system.model.device.name, tree.flat, comment)
 
 
 def _mjcf(run: RunFolder, system: System, p: Array) -> str:
-    drawn, robot = _drawn(run, system, p), _robot(run, system)
-    names = {identifier(joint.name): joint.name for joint in drawn.flat.joints}
+    tree, robot = _identify_tree(run, system, p), _robot(run, system)
+    names = {identifier(joint.name): joint.name for joint in tree.flat.joints}
     drives = np.diag(_drive_inertia(system, p))
     add, lacks = add_effects(system, p, robot, names, drives)
-    comment = _head(drawn, lacks)
-    return mjcf_text(system.model.device.name, drawn.flat, robot.gravity, comment, add)
+    comment = _head(tree, lacks)
+    return mjcf_text(system.model.device.name, tree.flat, robot.gravity, comment, add)
 
 
-def _head(drawn: _Drawn, lacks: Sequence[str]) -> str:
+def _head(tree: _IdentifiedTree, lacks: Sequence[str]) -> str:
     """Describe the origin of a model, moved masses, and the parts that the text lacks."""
-    parts = ["identified by bampipe", *drawn.notes]
+    parts = ["identified by bampipe", *tree.notes]
     return "; ".join([*parts, f"not in it: {', '.join(lacks)}"] if lacks else parts)
 
 
 @dataclass(frozen=True)
-class _Drawn:
+class _IdentifiedTree:
     """A robot's links and joints, as drawn and as identified.
 
     Attributes:
@@ -135,7 +135,7 @@ class _Drawn:
     notes: tuple[str, ...]
 
 
-def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
+def _identify_tree(run: RunFolder, system: System, p: Array) -> _IdentifiedTree:
     robot = _robot(run, system)
     bodies, limits = _identified_joints(robot, system, p)
     if not run.exists(DRAWING):
@@ -144,7 +144,7 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
         links = {f"{joint}_link": body for joint, body in bodies.items()}
         joints = [replace(j, limits=limits.get(j.name, j.limits)) for j in before.joints]
         after = replace(before, bodies={**before.bodies, **links}, joints=joints)
-        return _Drawn(None, before, after, after, "base", ())
+        return _IdentifiedTree(None, before, after, after, "base", ())
     file = run.path(DRAWING)
     before = read_tree(file)
     after = put_bodies(before, robot.base, robot.tip, bodies, limits)
@@ -168,7 +168,7 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
         )
     urdf = file if read_xml(file).tag == "robot" else None
     flat = hold_beside(after, robot.base, robot.tip)
-    return _Drawn(urdf, before, after, flat, robot.base, tuple(notes))
+    return _IdentifiedTree(urdf, before, after, flat, robot.base, tuple(notes))
 
 
 def _drive_inertia(system: System, p: Array) -> Array:

@@ -202,8 +202,8 @@ def _compute_probabilities(listed: Sequence[SetEvidence], seed: int) -> tuple[Se
     blocks = np.array([s.by_block for s in listed])
     count = blocks.shape[1]
     rng = np.random.default_rng([seed, count])
-    drawn = rng.multinomial(count, np.full(count, 1.0 / count), _DRAWS)
-    shares = softmax((drawn - 1.0) @ blocks.T + total, axis=1).mean(axis=0)
+    counts = rng.multinomial(count, np.full(count, 1.0 / count), _DRAWS)
+    shares = softmax((counts - 1.0) @ blocks.T + total, axis=1).mean(axis=0)
     sets = [replace(s, probability=float(p)) for s, p in zip(listed, shares, strict=True)]
     return tuple(sorted(sets, key=lambda s: -s.probability))
 

@@ -35,8 +35,8 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
     wrong = [name for name, body in zip(names, value, strict=True) if not is_possible(body)]
     if not wrong:
         return squares, []
-    drawn = np.array([joint.inertial for joint in robot.joints])
-    p = _find_nearest(system, squares, places.reshape(-1, INERTIAL), drawn)
+    nominal = np.array([joint.inertial for joint in robot.joints])
+    p = _find_nearest(system, squares, places.reshape(-1, INERTIAL), nominal)
     nearest = (
         f"The inertial parameters fitted to {join_names(wrong)} are physically impossible; the"
         " nearest"
@@ -47,10 +47,10 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
     return replace(squares, p=p), [f"{nearest} possible ones are published."]
 
 
-def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Array) -> Array:
+def _find_nearest(system: System, squares: SquaresFit, places: Array, nominal: Array) -> Array:
     """Return the nearest parameters (n_p + 1,) with possible bodies at ``places``.
 
-    ``places`` and the drawing's numbers, ``drawn``, are (b, 10).
+    ``places`` and the drawing's numbers, ``nominal``, are (b, 10).
     """
     count, unseen = squares.free.size, np.setdiff1d(places, squares.free)
     # The drawing determines the combinations that no motion shows.
@@ -62,7 +62,7 @@ def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Arr
     value[at >= 0] = squares.p[at[at >= 0]]
     low[:count], high[:count] = squares.problem.lower, squares.problem.upper
     bodies = np.array([[int(np.flatnonzero(at == place)[0]) for place in b] for b in places])
-    found, p = nearest_possible(value, weight, bodies, drawn, (low, high)), squares.p.copy()
+    found, p = nearest_possible(value, weight, bodies, nominal, (low, high)), squares.p.copy()
     p[at[at >= 0]] = found[at >= 0]
     return p
 

@@ -71,12 +71,12 @@ def assess_identifiability(
     value = p[problem.free]
     estimated = [i for i, name in enumerate(names) if name != TIMING]
     # Inertial parameters all compensate each other: `BaseEstimate` reports them.
-    drawn = set(np.flatnonzero(problem.precision))
-    own_words = [i for i in estimated if i not in drawn]
+    with_priors = set(np.flatnonzero(problem.precision))
+    own_words = [i for i in estimated if i not in with_priors]
     weak = [
         w
         for w in weak_directions(own)
-        if set(w.members) & set(own_words) and not set(w.members) & drawn
+        if set(w.members) & set(own_words) and not set(w.members) & with_priors
     ]
     groups = [set(group.members) for group in known.together]
     separable = [i for i in own_words if not any(names[i] in group for group in groups)]

@@ -284,8 +284,8 @@ class Device(DeclaredFile):
     @property
     def speed_limits(self) -> Mapping[str, float]:
         """Highest speed of each coordinate, if known, rad/s or m/s."""
-        drawn = {j.name: j.velocity for j in self.robot.moving if j.velocity} if self.robot else {}
-        return drawn | {axis: e.speed for axis, e in self.ranges.items() if e.speed is not None}
+        stated = {j.name: j.velocity for j in self.robot.moving if j.velocity} if self.robot else {}
+        return stated | {axis: e.speed for axis, e in self.ranges.items() if e.speed is not None}
 
     @property
     def acceleration_limits(self) -> Mapping[str, float]:
@@ -296,8 +296,8 @@ class Device(DeclaredFile):
     @property
     def effort_limits(self) -> Mapping[str, float]:
         """Largest effort of each coordinate's drive, if known, N.m or N."""
-        drawn = {j.name: j.effort for j in self.robot.moving if j.effort} if self.robot else {}
-        return drawn | {axis: e.effort for axis, e in self.ranges.items() if e.effort is not None}
+        stated = {j.name: j.effort for j in self.robot.moving if j.effort} if self.robot else {}
+        return stated | {axis: e.effort for axis, e in self.ranges.items() if e.effort is not None}
 
     def cross_faults(self) -> Iterator[InputError]:
         missing = [key for key in _NEEDED if key not in self.model_fields_set]

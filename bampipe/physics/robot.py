@@ -93,12 +93,12 @@ class Joint(NamedDeclaration):
         """
         if self.mass < 0.0:
             return np.zeros(INERTIAL)
-        c, drawn = np.array(self.center), _matrix(self.inertia)
+        c, tensor = np.array(self.center), _matrix(self.inertia)
         if self.impossible:
-            spread, axes = np.linalg.eigh(0.5 * np.trace(drawn) * np.eye(3) - drawn)
+            spread, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
             spread = np.maximum(spread, 0.0)
-            drawn = spread.sum() * np.eye(3) - axes * spread @ axes.T
-        about = drawn + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
+            tensor = spread.sum() * np.eye(3) - axes * spread @ axes.T
+        about = tensor + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
         upper = about[np.triu_indices(3)]
         return np.array([self.mass, *(self.mass * c), *upper])
 

@@ -129,7 +129,7 @@ class Comparison:
     _sums: dict[bytes, list[tuple[Array, ...]]] = field(default_factory=dict, init=False)
 
     @property
-    def drawn(self) -> Mounting:
+    def nominal(self) -> Mounting:
         """The mounting as drawn, under the stated gravity."""
         n, gravity = len(self.ratio), np.array(self.robot.gravity, dtype=float)
         return Mounting(np.ones(n), np.zeros(n), gravity)
@@ -354,9 +354,9 @@ def find_heavy(compared: Comparison, mounting: Mounting) -> HeavierBody | None:
 
     whole = [columns.sum(axis=1) for columns in bodies]
     rest = [drive - force for drive, force in zip(drives, whole, strict=True)]
-    drawn, scaled = misfit(rest), misfit(_fitted(rest, whole, size)[1])
+    nominal, scaled = misfit(rest), misfit(_fitted(rest, whole, size)[1])
     alone = misfit([_fitted([r], [w], [1.0])[1][0] for r, w in zip(rest, whole, strict=True)])
-    least = min(float(scaled.sum()), float(drawn.sum() + (alone - drawn).min()))
+    least = min(float(scaled.sum()), float(nominal.sum() + (alone - nominal).min()))
     best: tuple[float, HeavierBody, list[Array]] | None = None
     for place in range(bodies[0].shape[1]):
         change, left = _fitted(rest, [columns[:, place] for columns in bodies], size)

@@ -85,7 +85,7 @@ Judge = Callable[[Mounting], float]
 
 
 def find_mounting(
-    turning: Sequence[bool], drawn: Mounting, judge: Judge, stands: bool = False
+    turning: Sequence[bool], nominal: Mounting, judge: Judge, stands: bool = False
 ) -> Mounting:
     """Find the quarter turns, directions and gravity with which the drawing explains most.
 
@@ -93,16 +93,16 @@ def find_mounting(
     the first. Joints that do not turn can only change direction.
 
     Args:
-        drawn: the mounting as stated; judge: returns its `Comparison.misfit`.
+        nominal: the mounting as stated; judge: returns its `Comparison.misfit`.
         stands: whether gravity is fixed, as it must be if reductions are unknown too.
     """
 
     def cost(mounting: Mounting) -> float:
         return judge(mounting) + float(_WORTH * mounting.changes)
 
-    best, least = drawn, cost(drawn)
+    best, least = nominal, cost(nominal)
     for _ in range(_MOST_ROUNDS):
-        tried = [(cost(other), other) for other in _neighbours(best, drawn, turning, stands)]
+        tried = [(cost(other), other) for other in _neighbours(best, nominal, turning, stands)]
         score, other = min(tried, key=lambda one: one[0], default=(np.inf, best))
         if not score < least and not stands:
             other = _tilted(best, judge)
@@ -134,7 +134,7 @@ def _tilted(mounting: Mounting, judge: Judge) -> Mounting:
 
 
 def _neighbours(
-    best: Mounting, drawn: Mounting, turning: Sequence[bool], stands: bool
+    best: Mounting, nominal: Mounting, turning: Sequence[bool], stands: bool
 ) -> Iterator[Mounting]:
     one = {
         k: [
@@ -148,8 +148,8 @@ def _neighbours(
     singles = [best.counted({k: option}) for k, options in one.items() for option in options]
     for single in (best, *singles):
         yield single
-        if drawn.gravity.any() and not stands:
-            yield replace(single, gravity=drawn.gravity, hangs=False)
+        if nominal.gravity.any() and not stands:
+            yield replace(single, gravity=nominal.gravity, hangs=False)
             yield from (single.under(down) for down in _DOWN)
     # Two joints that are both wrong differ in their zeros, as a maker's zero posture does.
     for a, b in combinations(one, 2):

@@ -77,12 +77,12 @@ class DrawnSearch(Search):
     @cached_property
     def stated(self) -> Comparison:
         """Drives and the drawn bodies' forces, as stated except for a body that is too heavy."""
-        drawn = self._as_drawn
+        bodies = self._nominal_bodies
         if self.system.model.device.force_unit != "A":
-            self.heavier = find_heavy(drawn, drawn.drawn)
+            self.heavier = find_heavy(bodies, bodies.nominal)
         if self.heavier is None:
-            return drawn
-        return replace(drawn, robot=with_heavier_body(drawn.robot, self.heavier))
+            return bodies
+        return replace(bodies, robot=with_heavier_body(bodies.robot, self.heavier))
 
     @cached_property
     def roughly(self) -> Comparison:
@@ -95,7 +95,7 @@ class DrawnSearch(Search):
         return replace(self.stated, motions=motions, thin=keep, _required={})
 
     @cached_property
-    def _as_drawn(self) -> Comparison:
+    def _nominal_bodies(self) -> Comparison:
         robot, n = drawn_robot(self.system), len(self.system.coordinates)
         p = self.system.prior
         for i, item in enumerate(self.system.parameters):
@@ -131,7 +131,7 @@ class DrawnSearch(Search):
 
     def drives_against_bodies(self) -> list[str]:
         """Drives of a single joint whose stated sign is opposite to that of their bodies."""
-        drives = self._as_drawn.hold(self._as_drawn.drawn)
+        drives = self._nominal_bodies.hold(self._nominal_bodies.nominal)
         return [name for name, k in self._alone.items() if drives[k].is_turned]
 
     @cached_property
@@ -206,9 +206,9 @@ class DrawnSearch(Search):
         compared, rough = (self._compare(change, one) for one in (self.stated, self.roughly))
         if compared is None or rough is None:
             return ()
-        mounting = compared.drawn
+        mounting = compared.nominal
         if max(drive.left for drive in compared.hold(mounting)) > _SUSPICIOUS**2:
-            mounting = find_mounting(rough.turning, rough.drawn, rough.misfit)
+            mounting = find_mounting(rough.turning, rough.nominal, rough.misfit)
         for k, (axis, (direction, zero)) in enumerate(
             zip(self.signals.axes, mounting.by_joint, strict=True)
         ):

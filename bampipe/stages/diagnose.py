@@ -167,8 +167,8 @@ def _result(
     known = sorted({entry.effect.partition(":")[0] for entry in ranking[:_DESCRIBED]})
     maps = {}
     for i, axis in enumerate(names):
-        drawn = (residual_map(given, i, one) for one in variables(given.fitted, given.band, i))
-        maps[axis] = {m.variable: ResidualMap.of(m, variance_share=m.share) for m in drawn}
+        binned = (residual_map(given, i, one) for one in variables(given.fitted, given.band, i))
+        maps[axis] = {m.variable: ResidualMap.of(m, variance_share=m.share) for m in binned}
     result = DiagnoseResult(
         model=config.model,
         trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in session.trials.weighed)),

@@ -58,5 +58,5 @@ def draw_trials(sizes: Sequence[int]) -> list[int]:
     if total <= ENOUGH_SAMPLES:
         return list(range(len(sizes)))
     count = -(-len(sizes) * ENOUGH_SAMPLES // total)
-    drawn = np.random.default_rng(_SEED).permutation(len(sizes))[: max(count, LEAST_DRAWN)]
-    return sorted(int(number) for number in drawn)
+    chosen = np.random.default_rng(_SEED).permutation(len(sizes))[: max(count, LEAST_DRAWN)]
+    return sorted(int(number) for number in chosen)

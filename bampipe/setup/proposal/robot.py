@@ -101,9 +101,9 @@ class Logged:
         few, many = (self.compare(q, drives, ratio, rows) for rows in (FEW_ROWS, MOST_ROWS))
         if few is None or many is None:
             return None
-        mounting, judged = many.drawn, many.hold(many.drawn)
+        mounting, judged = many.nominal, many.hold(many.nominal)
         if max(drive.left for drive in judged) >= DOUBTED:
-            mounting = find_mounting(few.turning, few.drawn, few.misfit)
+            mounting = find_mounting(few.turning, few.nominal, few.misfit)
             judged = many.hold(mounting) if mounting.changes else judged
         return Gears(ratio, mounting, judged)
 
@@ -159,13 +159,13 @@ class Logged:
             return Gears(ratio, mounting, judged) if fits(judged) and ratio.min() >= 1.0 else None
 
         starts = [np.where(moved, factor * least, 1.0) for factor in _MARGINS]
-        ratio = min((fitted(start, few.drawn) for start in starts), key=lambda one: one[0])[1]
-        found = sound(ratio, few.drawn)
+        ratio = min((fitted(start, few.nominal) for start in starts), key=lambda one: one[0])[1]
+        found = sound(ratio, few.nominal)
         for start in starts if found is None else ():
             ratio = start
             for _ in range(_ALTERNATIONS):
                 geared = few.reread(np.diag(1.0 / ratio))
-                mounting = find_mounting(geared.turning, few.drawn, geared.misfit, stands=True)
+                mounting = find_mounting(geared.turning, few.nominal, geared.misfit, stands=True)
                 ratio = fitted(ratio, mounting)[1]
                 found = sound(ratio, mounting)
                 # Wrong zeros with reductions to match explain much; only the right ones all.
