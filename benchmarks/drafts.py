@@ -30,7 +30,7 @@ from independent.sensors import Conditions, hold_back
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import load_model, read_estimate, read_recipe
+from bampipe.declarations.model_file import load_model, read_estimate, read_spec
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.drafts.search import draft_formulas
 from bampipe.diagnosis.session import Session
@@ -184,7 +184,7 @@ def force_drafts(machine: str, seed: int) -> dict[str, tuple[float, tuple[str, .
         trials = read_measured_trials(run, system, every_input=True, timing=timing)
         session = Session(replace(trials, motions=tuple(trials.motions)), Criteria())
         found = draft_formulas(
-            session, read_recipe(run, "base", model), read_estimate(run, "base", system),
+            session, read_spec(run, "base", model), read_estimate(run, "base", system),
             range(len(system.coordinates)), "a benchmark",
         )  # fmt: skip
         return {

@@ -40,7 +40,7 @@ from measured import (
 from robots import BAND_HZ, dfki_double_pendulum, kuka_kr300, staubli_tx40, tiago
 from scipy.spatial.distance import cdist
 
-ModelSpec = Callable[[Path, Path], object]
+WriteSession = Callable[[Path, Path], object]
 CASES = ROOT.parent / "shared" / "cases" / "data"
 HELD_OUT_GAIN, FULL_DUTY = 200, 885.0
 FOLDS, CENTRES, RIDGE = 5, 300, 1e-2
@@ -75,7 +75,7 @@ def servo_pendulum(source: Path, folder: Path) -> None:
     (folder / "session.toml").write_text(text, encoding="utf-8")
 
 
-SETS: dict[str, tuple[str, ModelSpec]] = {
+SETS: dict[str, tuple[str, WriteSession]] = {
     "joint_2": ("robot_joints/joint_2", take_logs),
     "joint_5": ("robot_joints/joint_5", take_logs),
     "emps": ("emps", write_emps),
@@ -131,10 +131,10 @@ def _kernels(x: Array, centres: Array, width: float) -> Array:
     return np.asarray(np.exp(-0.5 * cdist(x, centres, "sqeuclidean") / width**2))
 
 
-def measure(source: Path, spec: ModelSpec, folder: Path, most_s: float) -> dict[str, Any]:
+def measure(source: Path, write: WriteSession, folder: Path, most_s: float) -> dict[str, Any]:
     """The row of one set."""
     folder.mkdir(parents=True)
-    spec(source, folder)
+    write(source, folder)
     runs, run = folder.parent / "runs", folder.parent / "runs" / folder.name
     begin, row = processor_seconds(), {"note": ""}
     try:
@@ -185,13 +185,13 @@ def main() -> None:
     path = given.out or RESULTS / "measured_sets.json"
     rows = json.loads(path.read_text(encoding="utf-8"))["result"] if path.exists() else {}
     for name in given.only or SETS:
-        below, spec = SETS[name]
+        below, write = SETS[name]
         source = given.data / below if below else given.cases / name
         if not source.is_dir():
             print(f"{name}: skipped, {source} is not here")
             continue
         shutil.rmtree(work / name, ignore_errors=True)
-        rows[name] = measure(source, spec, work / name / name, given.most)
+        rows[name] = measure(source, write, work / name / name, given.most)
         print(name, json.dumps(rows[name]), flush=True)
         store("measured_sets", {key: rows[key] for key in SETS if key in rows}, path)
 

@@ -71,7 +71,7 @@ def select(run: bampipe.Run) -> tuple[Selection, Search, Session]:
 def draw_residual(found: Selection) -> None:
     """The residual of the final model around a reversal beside its biases; scatter by speed."""
     fit = found.final
-    e, noise, here = fit.evidence, fit.likelihood.noise, fit.likelihood.samples[0]
+    e, noise, here = fit.linearisation, fit.likelihood.noise, fit.likelihood.samples[0]
     y = take_samples(e.residual, here, 0)
     speed = take_samples([m.qd[e.band.thinned_rows(len(m.t))] for m in e.motions], here, 0)
     step = e.band.step / e.band.rate_hz
