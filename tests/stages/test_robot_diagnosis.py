@@ -74,7 +74,6 @@ def test_joints_that_stick_are_held_against_replicates_that_do(tmp_path: Path) -
     run = run_arm(tmp_path, 33, "ZY", {}, soft_hz=4.0, noise=0.01, rate_hz=250.0)
     found = read_json(run.path("models/base/validate.json"))
     assert {entry["standing"] for entry in found["axes"].values()} == {"at_floor"}
-    assert any("stand still where the motion turns" in note for note in found["notes"])
 
 
 @pytest.mark.long
