@@ -48,7 +48,7 @@ may leave than the other way round."""
 _STEADY = 50.0
 """Of the median step: the longest one of a time."""
 _COPIED = 1e-3
-"""Share of a column that a copy of it in another unit leaves: what rounding does."""
+"""Residual of a column regressed on a copy of it, over its standard deviation: rounding alone."""
 _MOST_IN_TURN, _GOES_ON, _LEAPS = 64, 0.2, 0.4
 """Quantities that take turns in one column, the most; change from one reading of a quantity to its
 next, over that from row to row, the most; the latter, squared, over twice the variance, the least.

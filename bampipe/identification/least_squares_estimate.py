@@ -149,10 +149,8 @@ class SquaresFit:
         inverse = invert_scaled(self.normal)
         fitted = float(np.trace(inverse @ (self.normal - pose.precision)))
         # With fewer than three blocks per parameter, use shorter blocks.
-        band, seconds = (
-            self.trials.band,
-            sum(self.fit.linearisation.sizes) / self.trials.band.rate_hz,
-        )
+        band = self.trials.band
+        seconds = sum(self.fit.linearisation.sizes) / band.rate_hz
         most = max(
             seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), _PERIODS / min(band.cutoff_hz)
         )

@@ -345,10 +345,8 @@ class Comparison:
         sums = [self.sums([motion]) for motion in motions]
         then = [self.contrasts(self.sums_now + new, new) for new in sums]
         chances, weights = [self.confusions(found) for found in then], self.weights()
-        before, axes = (
-            self.confusions(self.contrasts_now),
-            self.fit.linearisation.system.coordinates,
-        )
+        before = self.confusions(self.contrasts_now)
+        axes = self.fit.linearisation.system.coordinates
         expected = []
         for pair in self.contrasts_now:
             left = np.median([found[pair].left for found in then], axis=0).tolist()

@@ -118,18 +118,7 @@ def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[Detec
         expected = left.distance(sums.independent, _STRENGTHS)
         # The variance of a log likelihood ratio is twice its expectation.
         surely = expected - sure * np.sqrt(2.0 * expected)
-        # The penalty of the priors on the log evidence at each strength.
-        item, values = alternative.items[0], alternative.values[0]
-        linear, information = list(item.linear_indices), comparison.information(sums, number)
-        typical, spread, factors = np.ones(1), np.ones(1), np.ones_like(_STRENGTHS)
-        if linear:
-            typical, factors = np.abs(values[linear]), _STRENGTHS
-            spread = np.array([item.parameters[i].sd for i in linear]) / typical
-        if alternative.slopes:
-            information = information * np.outer(values[linear], values[linear])
-        strengths = factors[:, None] * np.ones_like(typical)
-        penalty = penalise(information, spread, strengths, len(item.searched_indices))
-        excess = surely - needed - penalty
+        excess = surely - needed - _find_penalty(comparison, sums, number)
         enough = np.flatnonzero(excess >= 0.0)
         factor = float("inf")
         if enough.size:
@@ -143,6 +132,21 @@ def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[Detec
         factor = max(factor, float(criteria.size / max(size, 1e-300) + scatter))
         found.append(DetectionLimit(alternative, _cap_factor(factor), int(np.argmax(left.squares))))
     return found
+
+
+def _find_penalty(comparison: Comparison, sums: Sums, number: int) -> Array:
+    """Return the penalty of the priors on the log evidence of an alternative at each strength."""
+    alternative = comparison.alternatives[number]
+    item, values = alternative.items[0], alternative.values[0]
+    linear, information = list(item.linear_indices), comparison.information(sums, number)
+    typical, spread, factors = np.ones(1), np.ones(1), np.ones_like(_STRENGTHS)
+    if linear:
+        typical, factors = np.abs(values[linear]), _STRENGTHS
+        spread = np.array([item.parameters[i].sd for i in linear]) / typical
+    if alternative.slopes:
+        information = information * np.outer(values[linear], values[linear])
+    strengths = factors[:, None] * np.ones_like(typical)
+    return penalise(information, spread, strengths, len(item.searched_indices))
 
 
 def _cap_factor(factor: float) -> float:

@@ -177,10 +177,9 @@ def _standard_errors(linearisation: Linearisation) -> Array:
     free, found = list(linearisation.free), np.zeros(len(linearisation.p))
     prior_sd = np.array([linearisation.system.parameters[i].sd for i in free])
     size = np.maximum(prior_sd, np.finfo(float).tiny)
-    normal = np.einsum("q,kqij->ij", linearisation.weight, linearisation.sums.xx) * np.outer(
-        size, size
-    )
-    values, directions = np.linalg.eigh(normal + VAGUE**-2.0 * np.eye(len(free)))
+    normal = np.einsum("q,kqij->ij", linearisation.weight, linearisation.sums.xx)
+    normal = normal * np.outer(size, size) + VAGUE**-2.0 * np.eye(len(free))
+    values, directions = np.linalg.eigh(normal)
     # Rounding may give negative information to combinations that the trials do not show.
     found[free] = size * np.sqrt(directions**2 @ (1.0 / np.maximum(values, VAGUE**-2.0)))
     return found

@@ -72,11 +72,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     with ParquetAppender(out / "ingest/samples.parquet") as samples:
         rows = _ingest_trials(session, config, every, channels, samples, progress)
     text = ("trial_id", "file", "kind", "locked_axis", "status", "reason", "repairs")
-    trials = (
-        pd.DataFrame(rows)
-        .drop(columns=["dead", "spans", "stated"])
-        .astype(dict.fromkeys(text, "string"))
-    )
+    trials = pd.DataFrame(rows).drop(columns=["dead", "spans", "stated"])
+    trials = trials.astype(dict.fromkeys(text, "string"))
     write_parquet(out / "ingest/trials.parquet", trials)
     # The announced rate, or the median of the trials if the time stamps disagree.
     rate, measured = session.sample_rate / every, float(trials["sample_rate_hz"].median())
