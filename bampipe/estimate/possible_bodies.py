@@ -18,7 +18,8 @@ _ROUNDING = 1e-9
 _ANCHOR = 1e-4
 """Fraction of each number's weight that draws it to the estimate if the others do not."""
 _FIRST, _SHARPER, _GAP = 1e-6, 10.0, 1e-6
-"""First weight of the cost over the barrier, its growth, and the excess cost allowed at the end."""
+"""First weight of the cost over the barrier, its growth, and the excess cost allowed at the end,
+as a fraction of the cost if that is above one."""
 _STEPS, _CENTRED, _SHORTEST = 50, 1e-6, 1e-9
 """Largest number of steps at one weight, decrease that ends them, and shortest relative step."""
 _AT_BOUND = 1e-2
@@ -77,14 +78,14 @@ def nearest_possible(
         """The barrier, infinite outside, with its gradient (n,) and Hessian (n, n)."""
         matrices = np.array([pseudo_inertia(body) for body in x[bodies]])
         gaps = np.concatenate([x[others] - low, high - x[others]])
-        eigenvalues = np.linalg.eigvalsh(matrices)
+        values, vectors = np.linalg.eigh(matrices)
         height, gradient, hessian = np.inf, np.zeros(x.size), np.zeros((x.size, x.size))
-        if eigenvalues.min() > 0.0 and gaps.min(initial=1.0) > 0.0:
-            height = -float(np.log(eigenvalues).sum() + np.log(gaps[np.isfinite(gaps)]).sum())
+        if values.min() > 0.0 and gaps.min(initial=1.0) > 0.0:
+            height = -float(np.log(values).sum() + np.log(gaps[np.isfinite(gaps)]).sum())
             below, above = np.split(1.0 / gaps, 2)
             gradient[others], hessian[others, others] = above - below, below**2 + above**2
-            for body, matrix in zip(bodies, matrices, strict=True):
-                change = np.linalg.solve(matrix, _UNIT_BODIES)
+            for body, w, v in zip(bodies, values, vectors, strict=True):
+                change = (v / w) @ v.T @ _UNIT_BODIES
                 gradient[body] = -np.trace(change, axis1=1, axis2=2)
                 hessian[np.ix_(body, body)] = np.einsum("kij,lji->kl", change, change)
         return height, gradient, hessian
@@ -106,7 +107,8 @@ def nearest_possible(
                     break
                 share *= 0.5
             x = x + share * step
-        if limits < _GAP * sharpness:
+        away = x - value
+        if limits < _GAP * sharpness * max(1.0, float(away @ weight @ away)):
             break
         sharpness *= _SHARPER
     near = _AT_BOUND * sd[others]

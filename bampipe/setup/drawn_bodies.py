@@ -160,7 +160,9 @@ class Comparison:
             parts = self.robot.drawn_forces(q, qd, qdd, gravity) / self.ratio
             beside = np.hstack(list(parts.reshape(4, -1, n)))
             found.append(self.thin(beside, list(range(n)) * 4))
-        return np.concatenate(found).reshape(-1, 4, n).transpose(1, 0, 2)
+        parts = np.concatenate(found).reshape(-1, 4, n).transpose(1, 0, 2)
+        # Rounding errors of a force that is zero by symmetry are not a force.
+        return np.where(np.abs(parts) > 1e-9 * np.abs(parts).max(initial=0.0), parts, 0.0)
 
     def by_body(self, mounting: Mounting) -> list[Array]:
         """By joint, the drive that each drawn body requires, less the losses, (K, bodies)."""

@@ -53,3 +53,14 @@ def test_the_nearest_is_possible_and_no_other_is_nearer() -> None:
         other = np.append(bodies(2).ravel(), [RNG.uniform(0.0, 3.0), RNG.normal()])
         for share in (1e-3, 1e-2, 0.1):
             assert distance((1.0 - share) * found + share * other) > distance(found) * (1 - 1e-6)
+
+
+def test_a_point_mass_that_was_fitted_to_nearly_noise_free_trials_has_a_nearest_possible_body():
+    """Its pseudo-inertia is singular, and a large weight drives the search to the very edge."""
+    for _ in range(40):
+        mass, far = 10.0 ** RNG.uniform(-3.0, 3.0), RNG.uniform(0.0, 0.3)
+        start = body(np.array([[0.0, 0.0, far]]), np.array([mass]))
+        value = start + RNG.normal(size=10) * mass * 10.0 ** RNG.uniform(-3.0, 1.0)
+        weight = np.diag(10.0 ** RNG.uniform(-4.0, 8.0, 10))
+        bounds = -EVERY[:10], EVERY[:10]
+        assert is_possible(nearest_possible(value, weight, PLACES[:1], start[None], bounds))

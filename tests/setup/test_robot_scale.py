@@ -10,6 +10,7 @@ from bampipe.data.device_file import complete_device
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
+from bampipe.setup.drawn_bodies import Comparison, JointMotion
 from bampipe.setup.hypotheses import scale_correction
 from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch
@@ -200,6 +201,20 @@ def test_a_base_that_does_not_stand_is_found_with_the_joint_that_is_reversed(
 
 
 REVERSED = np.array([1.0, -1.0, 1.0, 1.0])
+
+
+def test_rounding_errors_of_a_point_mass_on_its_axis_are_no_torque() -> None:
+    """Such a body needs none: taken for one, they gave a unit that was wrong by 1e15."""
+    robot, motion = arm().model.device.robot, motions(1.0, 2.0)[0]
+    assert robot is not None
+    point = {"center": (0.0, 0.0, 0.15), "inertia": (0.0,) * 6}
+    last = robot.joints[-1].model_copy(update=point)
+    robot = robot.model_copy(update={"joints": (*robot.joints[:-1], last)})
+    drives = np.column_stack([motion.channels[name] for name in FORCES])
+    compared = Comparison(robot, (True,) * 4, [JointMotion(*motion.kinematics)], drives, np.ones(4))
+    *others, of_last = compared.hold(compared.nominal)
+    assert of_last.share == 0.0 and not of_last.is_sure
+    assert all(drive.is_sure for drive in others)
 
 
 @pytest.mark.parametrize(("tool", "factor"), [(1.0, None), (5.0, 5.0 * OFF[3])])
