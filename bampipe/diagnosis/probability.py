@@ -140,28 +140,36 @@ def weigh_sets(
                 drops[effect] = _find_evidence_losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
-    excess = _compute_excess(costs)
+    now = _sum_squares(costs.residual_rows(()))
+    excess = _compute_excess(costs, now)
     sets, unknown = _add_unknown(sets, excess), np.maximum(unknown, excess)
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
+    noise = np.minimum(now, costs.problem.count)
+    for axis, function in enumerate(functions):
+        if function is not None:
+            noise[axis] = min(noise[axis], *_sum_squares(function.residual[axis : axis + 1]))
     for effect in own if doubtful.any() else ():
         # A doubtful effect is not absent: the model keeps it, and the report mentions it.
-        most = max(_share_explained(costs, effect, doubtful), 1.0 - criteria.probability)
+        without = _sum_squares(costs.residual_rows(((f"-{effect}", ()),)))
+        gain = 0.5 * costs.problem.independent * np.log(without / now)
+        share = _share_explained(now - noise, without - noise, gain, doubtful)
+        most = max(share, 1.0 - criteria.probability)
         effects[effect] = min(effects[effect], most)
     return Probabilities(sets, effects, if_all_known, unknown, tuple(functions), drops)
 
 
-def _sum_squares(costs: SetCosts, keys: tuple[Key, ...]) -> Array:
-    """Return the sum of squares of the residual of a set in units of the noise, (n_q,)."""
-    return np.array([max(float(rows @ rows), 1e-300) for rows in costs.residual_rows(keys)])
+def _sum_squares(residual: Sequence[Array]) -> Array:
+    """Return the sum of squares of the residual of each axis, (n_q,)."""
+    return np.array([max(float(rows @ rows), 1e-300) for rows in residual])
 
 
-def _compute_excess(costs: SetCosts) -> Array:
+def _compute_excess(costs: SetCosts, squares: Array) -> Array:
     """Return the probability that the residual of each axis exceeds noise and discrepancy, (n_q,).
 
     With flat prior and N independent samples, log s is normal with variance 1/(2 N).
     """
     p = costs.problem
-    log_scale = 0.5 * np.log(_sum_squares(costs, ()) / np.maximum(p.count, 1))
+    log_scale = 0.5 * np.log(squares / np.maximum(p.count, 1))
     return np.asarray(ndtr(log_scale * np.sqrt(2.0 * p.independent)))
 
 
@@ -183,17 +191,20 @@ def _add_unknown(sets: Sequence[SetEvidence], excess: Array) -> tuple[SetEvidenc
     return tuple(sorted([*rest, *beside.values()], key=lambda s: -s.probability))
 
 
-def _share_explained(costs: SetCosts, effect: str, far: Flags) -> float:
+def _share_explained(now: Array, without: Array, gain: Array, far: Flags) -> float:
     """Return the largest share of the error without an effect that it explains on ``far`` axes.
 
     Something unknown there may resemble an effect that leaves a large error. The share is 1 if the
     other axes support the effect by `_MARGIN`, or more than these.
+
+    Args:
+        now, without: squares beyond noise with and without the effect, (n_q,).
+        gain: log evidence of the effect on each axis, nats, (n_q,).
     """
-    now, without = _sum_squares(costs, ()), _sum_squares(costs, ((f"-{effect}", ()),))
-    gain = 0.5 * costs.problem.independent * np.log(without / now)
     if gain[~far].sum() >= min(gain[far].sum(), _MARGIN):
         return 1.0
-    return float(np.max(1.0 - np.sqrt(now[far] / without[far])))
+    ratio = now[far] / np.maximum(without[far], 1e-300)
+    return float(np.max(1.0 - np.sqrt(np.maximum(ratio, 0.0))))
 
 
 def _compute_probabilities(listed: Sequence[SetEvidence], seed: int) -> tuple[SetEvidence, ...]:

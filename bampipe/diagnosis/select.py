@@ -239,14 +239,19 @@ def _fit_better(
 
 
 def _without_weakest(search: Search, given: Collection[str]) -> list[tuple[Key, ...]]:
-    """Return the removal of the weakest effect if the shapes of others could replace it.
+    """Return the removals of the weakest effects if the shapes of others could replace them.
 
-    The linear problem at the present shapes does not show how well they could.
+    The linear problem at the present shapes does not show how well they could. It may be wrong of
+    any effect where a residual exceeds noise and discrepancy, else of the weakest alone.
     """
-    own = [e for e in search.problem.absence if e not in given]
-    weakest = min(own, key=lambda e: search.cost(((f"-{e}", ()),)), default=None)
-    shaped = any(search.problem.shapes[e] for e in own if e != weakest)
-    return [((f"-{weakest}", ()),)] if shaped else []
+    p = search.problem
+    own = sorted(
+        (e for e in p.absence if e not in given), key=lambda e: search.cost(((f"-{e}", ()),))
+    )
+    squares = [float(rows @ rows) for rows in search.residual_rows(())]
+    weakest = own if np.any(np.array(squares) > p.count) else own[:1]
+    shaped = [e for e in own if p.shapes[e]]
+    return [((f"-{e}", ()),) for e in weakest if {*shaped} - {e}]
 
 
 def _leave_out(

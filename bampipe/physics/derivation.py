@@ -139,6 +139,7 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
     prompt_force = _find_prompt_forces(d) if measures else []
     # All is in terms of the logged inputs until they are replaced by their acting parts.
     delivered_force, pull = list(inputs.logged), [sp.S.Zero for _ in d.axes]
+    d.support = d.table(device.torque, "torque")
     states = {z: (rate, inputs.initial[z]) for z, rate in inputs.rates.items()}
     for item in acting:
         effect, by_axis = item.effect, offset if item.effect.kind == "measurement" else other
@@ -173,6 +174,8 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
             by_axis[axis] += value
             if effect.pulls:
                 pull[axis] += value
+            if effect.is_part_of_support(device):
+                d.support[axis] += value
             if by_axis is other and effect.acting_link:
                 delivered_force[axis] += value
         states |= {z: (rate, start) for z, rate, start in inputs.build_states(item, symbols)}

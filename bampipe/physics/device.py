@@ -388,6 +388,16 @@ class Device(DeclaredFile):
         """Whether the device's potential energy depends on the position of ``axis``."""
         return axis in expression.reached_names([self.potential], self.definitions)
 
+    @cached_property
+    def own_of_torque(self) -> frozenset[str]:
+        """Constants and definitions that nothing but the device's own torques uses."""
+        rest = [self.kinetic, self.potential, *self.applied.values(), *self.side_load.values()]
+        used, others = (
+            expression.reached_names(trees, self.definitions)
+            for trees in (self.torque.values(), rest)
+        )
+        return frozenset(used - others)
+
     @property
     def components(self) -> tuple[str, ...]:
         """Short names of the forces: ``x`` for the channel ``force_x``, ``duty`` for ``duty``."""

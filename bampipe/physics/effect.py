@@ -262,6 +262,15 @@ class Effect(DeclaredFile):
         return bool(self.terms & {"weight", "pull"})
 
     @property
+    def uses_support(self) -> bool:
+        """Whether it acts on the device's own torque, such as that of a gravity compensator."""
+        return "support" in self.terms
+
+    def is_part_of_support(self, device: Device) -> bool:
+        """Whether it changes the device's own torque: it names what nothing else uses."""
+        return self.kind == "torque" and bool(self.names & device.own_of_torque)
+
+    @property
     def uses_inertia(self) -> bool:
         """Whether it acts on what the energies require of its axis."""
         return self.ahead is not None or bool(self.names & {"axis_inertia", "axis_bias"})
@@ -286,6 +295,7 @@ class Effect(DeclaredFile):
         known = {derivative(symbol, k) for symbol in symbols for k in range(len(INPUT_ORDERS))}
         terms = ("qd", "applied", "viscous", "coulomb", "load", "weight", "pull")
         known |= {f"{term}_{axis}" for term in terms for axis in axes} | {"t", *axes}
+        known |= {f"support_{axis}" for axis in device.torque}
         known |= {*device.definitions, *device.constants, *device.channels, *self.parameters}
         known |= {entry.name for entry in (*device.parameters, *self.states)}
         return keys <= places and self.names <= known | {*device.brakes.values()}

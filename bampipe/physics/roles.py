@@ -4,7 +4,6 @@ from typing import Any
 
 import sympy as sp
 
-from bampipe.physics import expression
 from bampipe.physics.device import derivative
 from bampipe.physics.signals import ActingInputs
 from bampipe.physics.vocabulary import Vocabulary
@@ -14,27 +13,20 @@ def find_compensation(d: Vocabulary, potential: Any, inputs: ActingInputs) -> li
     """Return the generalised force of a gravity compensator, one expression per coordinate.
 
     That is a torque of the device's own table, on a coordinate that the potential energy depends
-    on, that itself depends on the pose; with the effects that name it, or a constant or definition
-    that nothing but that torque uses (a compensator that lags or is mistuned).
+    on, that itself depends on the pose; with the effects on it (a compensator that lags or is
+    mistuned).
 
-    ``potential`` is the energy of the model.
+    ``potential`` is the energy of the model, whose terms have been collected.
     """
-    device = d.model.device
-    torque = d.table(device.torque, "torque")
+    torque = d.table(d.model.device.torque, "torque")
     balanced = [
         t.free_symbols & set(d.q) and potential.has(q) for t, q in zip(torque, d.q, strict=True)
     ]
-    results = [t if kept else sp.S.Zero for t, kept in zip(torque, balanced, strict=True)]
-    rest = [device.kinetic, device.potential, *device.applied.values(), *device.side_load.values()]
-    of_torque, of_rest = (
-        expression.reached_names(trees, device.definitions)
-        for trees in (device.torque.values(), rest)
-    )
-    own = of_torque - of_rest
-    for item in (e for e in d.model.effects if e.effect.kind == "torque" and any(balanced)):
+    results = [s if kept else sp.S.Zero for s, kept in zip(d.support, balanced, strict=True)]
+    for item in (e for e in d.model.effects if e.effect.uses_support):
         for key, tree in item.effect.expressions.items():
             place = d.axes.index(item.target_of(key))
-            if balanced[place] and expression.names(tree) & own:
+            if balanced[place]:
                 symbols = d.effect_symbols(item, inputs.logged, inputs.side)
                 results[place] += d.build(tree, symbols, key, item)
     return results

@@ -27,6 +27,7 @@ def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
         link = item.effect.acting_link
         effect = item.effect
         last = "dry" in effect.names or effect.uses_weight or effect.uses_inertia
+        last |= effect.uses_support
         return (_ORDER[link] if link else len(_ORDER), last, item.name)
 
     return sorted(effects, key=order_key)
@@ -36,7 +37,8 @@ def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
     """Whether the action of ``item`` changes, beyond first order, with ``earlier`` in the model.
 
     That holds behind a lag or a saturation of an input that it uses, behind effects on the same dry
-    friction, behind springs if it acts on the pull, and for two effects of positions.
+    friction, behind springs if it acts on the pull, behind what changes the device's own torque if
+    it acts on that, and for two effects of positions.
     """
     if item.effect.kind == "measurement" or earlier.effect.kind == "measurement":
         return item.effect.kind == earlier.effect.kind
@@ -44,6 +46,8 @@ def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
         return earlier.effect.kind in ("torque", "input")
     if "pull" in item.effect.terms and earlier.effect.pulls:
         return item.effect.scope == "device" or item.target == earlier.target
+    if item.effect.uses_support and earlier.effect.is_part_of_support(device):
+        return True
     if earlier.effect.acting_link not in ("lag", "saturation"):
         return False
     changed = {earlier.target} & set(device.channels) or set(device.forces)

@@ -286,7 +286,7 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict
     second = _UNITS["s"]
     symbols = _device_symbols(device, _Findings())
     for axis, unit, torque in _axes(device):
-        terms = ("applied", "load", "coulomb", "weight", "pull")
+        terms = ("applied", "load", "coulomb", "weight", "pull", "support")
         symbols |= dict.fromkeys((f"{term}_{axis}" for term in terms), torque)
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":

@@ -62,6 +62,7 @@ class Vocabulary:
         self.sizes: dict[str, int] = {}
         zeros = [sp.S.Zero] * len(self.axes)
         self.dry, self.weight, self.pull, self.inertia, self.bias = (zeros for _ in range(5))
+        self.support = zeros
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.constants = [constant_symbol(name) for name in device.constants if named_constants]
@@ -179,6 +180,7 @@ class Vocabulary:
         for i, a in enumerate(self.axes):
             symbols |= {f"applied_{a}": applied[i], f"load_{a}": sp.Abs(applied[i])}
             symbols |= {f"weight_{a}": self.weight[i], f"pull_{a}": self.pull[i]}
+            symbols[f"support_{a}"] = self.support[i]
             for term in ("viscous", "coulomb"):
                 symbols[f"{term}_{a}"] = self.p.get(f"{term}.{a}", sp.S.Zero)
         if item.effect.scope == "axis":

@@ -300,7 +300,7 @@ def test_effects_of_the_compensator_change_its_torque_and_others_do_not() -> Non
     wrong = {"gravity_compensator_mistuned.error": 0.1}
     behind = Q[:, 2:] - 0.461 - 0.05
     found = torque(system, wrong, behind)[:, 1]
-    np.testing.assert_allclose(found, 1.1 * BALANCED - 3.56 * 9.81 * 0.05 * np.cos(Q[:, 1]))
+    np.testing.assert_allclose(found, 1.1 * (BALANCED - 3.56 * 9.81 * 0.05 * np.cos(Q[:, 1])))
 
 
 def test_an_offset_where_nothing_is_to_be_balanced_is_none() -> None:
