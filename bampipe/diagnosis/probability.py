@@ -140,21 +140,13 @@ def weigh_sets(
                 drops[effect] = _find_evidence_losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
-    now = _sum_squares(costs.residual_rows(()))
-    excess = _compute_excess(costs, now)
+    excess = _compute_excess(costs)
     sets, unknown = _add_unknown(sets, excess), np.maximum(unknown, excess)
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
-    noise = np.minimum(now, costs.problem.count)
-    for axis, function in enumerate(functions):
-        if function is not None:
-            noise[axis] = min(noise[axis], *_sum_squares(function.residual[axis : axis + 1]))
     for effect in own if doubtful.any() else ():
         # A doubtful effect is not absent: the model keeps it, and the report mentions it.
-        without = _sum_squares(costs.residual_rows(((f"-{effect}", ()),)))
-        gain = 0.5 * costs.problem.independent * np.log(without / now)
-        share = _share_explained(now - noise, without - noise, gain, doubtful)
-        most = max(share, 1.0 - criteria.probability)
-        effects[effect] = min(effects[effect], most)
+        share = _share_explained(costs, effect, functions, doubtful)
+        effects[effect] = min(effects[effect], max(share, 1.0 - criteria.probability))
     return Probabilities(sets, effects, if_all_known, unknown, tuple(functions), drops)
 
 
@@ -163,13 +155,13 @@ def _sum_squares(residual: Sequence[Array]) -> Array:
     return np.array([max(float(rows @ rows), 1e-300) for rows in residual])
 
 
-def _compute_excess(costs: SetCosts, squares: Array) -> Array:
+def _compute_excess(costs: SetCosts) -> Array:
     """Return the probability that the residual of each axis exceeds noise and discrepancy, (n_q,).
 
     With flat prior and N independent samples, log s is normal with variance 1/(2 N).
     """
     p = costs.problem
-    log_scale = 0.5 * np.log(squares / np.maximum(p.count, 1))
+    log_scale = 0.5 * np.log(_sum_squares(costs.residual_rows(())) / np.maximum(p.count, 1))
     return np.asarray(ndtr(log_scale * np.sqrt(2.0 * p.independent)))
 
 
@@ -191,19 +183,23 @@ def _add_unknown(sets: Sequence[SetEvidence], excess: Array) -> tuple[SetEvidenc
     return tuple(sorted([*rest, *beside.values()], key=lambda s: -s.probability))
 
 
-def _share_explained(now: Array, without: Array, gain: Array, far: Flags) -> float:
+def _share_explained(
+    costs: SetCosts, effect: str, functions: Sequence[Unknown | None], far: Flags
+) -> float:
     """Return the largest share of the error without an effect that it explains on ``far`` axes.
 
-    Something unknown there may resemble an effect that leaves a large error. The share is 1 if the
-    other axes support the effect by `_MARGIN`, or more than these.
-
-    Args:
-        now, without: squares beyond noise with and without the effect, (n_q,).
-        gain: log evidence of the effect on each axis, nats, (n_q,).
+    Something unknown there may resemble an effect that leaves a large error. The noise, which the
+    unknown function leaves, is not part of it. The share is 1 if the other axes support the effect
+    by `_MARGIN`, or more than these.
     """
+    p = costs.problem
+    now, without = (_sum_squares(costs.residual_rows(k)) for k in ((), ((f"-{effect}", ()),)))
+    gain = 0.5 * p.independent * np.log(without / now)
     if gain[~far].sum() >= min(gain[far].sum(), _MARGIN):
         return 1.0
-    ratio = now[far] / np.maximum(without[far], 1e-300)
+    rest = [now if f is None else _sum_squares(f.residual) for f in functions]
+    noise = np.minimum(np.diag(rest), np.minimum(p.count, now))
+    ratio = (now - noise)[far] / np.maximum(without - noise, 1e-300)[far]
     return float(np.max(1.0 - np.sqrt(np.maximum(ratio, 0.0))))
 
 

@@ -103,17 +103,22 @@ def test_blocks_of_one_trial_are_mapped_under_its_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("without", "gain", "share"),
+    ("without", "share"),
     [
-        ((40.0, 0.0), (50.0, 0.0), 0.5),  # only the axis that is far shows it
-        ((40.0, 1.0), (50.0, 40.0), 1.0),  # the other one does, by 40 nats
-        ((11.0, 1.0), (1.0, 9.5), 1.0),  # by less than 14, but by more than the far one
+        ((30.0, 1.0), 1.0 - np.sqrt(300.0 / 800.0)),  # only the axis that is far shows it
+        ((30.0, 1.5), 1.0),  # the other one does, by 40 nats
+        ((20.2, 1.1), 1.0),  # the other one does, if by less than 14, by more than the far one
     ],
 )
-def test_what_only_an_axis_far_above_the_noise_shows_is_as_sure_as_its_share(without, gain, share):
-    """Squares beyond the noise fall from 40 to 10, so that half of the amplitude is explained."""
-    now, far = np.array([10.0, 0.0]), np.array([True, False])
-    found = _share_explained(now, np.array(without), np.array(gain), far)
+def test_what_only_an_axis_far_above_the_noise_shows_is_as_sure_as_its_share(without, share):
+    """The share is that of what exceeds the noise, which an unknown function leaves."""
+    rows = {(): (20.0, 1.0), (("-stribeck:yaw", ()),): without}
+    search = SimpleNamespace(
+        problem=SimpleNamespace(independent=np.array([100.0, 100.0]), count=np.array([5e3, 50.0])),
+        residual_rows=lambda keys: [np.full(50, level) for level in rows[keys]],
+    )
+    unknown = SimpleNamespace(residual=(np.full(50, 10.0), np.ones(50)))
+    found = _share_explained(search, "stribeck:yaw", (unknown, None), np.array([True, False]))
     assert found == pytest.approx(share)
 
 
