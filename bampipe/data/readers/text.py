@@ -91,8 +91,13 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
     with opened(path) as file:
         stream = _sheet(file) if path.suffix.lower().startswith(".xls") else file
         head = stream.read(HEAD)
+        stream.seek(max(stream.seek(0, io.SEEK_END) - HEAD, 0))
+        tail = stream.read()
         stream.seek(0)
         encoding = dialect.encoding or _encoding(head)
+        if b"\0" in head + tail and not encoding.startswith("utf-16"):
+            # A logger reserves space that it does not fill, or loses power before it has.
+            stream = io.BytesIO(stream.read().replace(b"\0", b""))
         whole = head[: head.rfind(b"\n") + 1] or head
         form = rewriting.find_form(whole.decode(encoding, "ignore").removeprefix("\ufeff"))
         if encoding == "utf-8" and form is None:
