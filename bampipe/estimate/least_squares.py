@@ -29,6 +29,8 @@ _LEAST_STEP = 1e-8
 """Finite difference relative to the parameter: half the digits of a number."""
 _SMALLEST_SHARE = 1e-3
 """Fraction of a Gauss-Newton step at which its halving ends."""
+_LARGEST = 1e100
+"""A residual or slope above this has no finite square."""
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
 Slopes = Callable[[int, Array, Sequence[int]], tuple[Sequence[int], Array]]
@@ -316,10 +318,11 @@ def as_measured(problem: Problem, p: Array, stacked: Iterable[Stacked]) -> Itera
 
 def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) -> None:
     """Name the parameter that makes the residual of a trial not finite at the start of the fit."""
-    if not np.isfinite(stacked.residual).all():
+    residual, slope = (np.abs(x) < _LARGEST for x in (stacked.residual, stacked.slope))
+    if not residual.all():
         culprit = "with the parameters that the fit starts from"
-    elif not np.isfinite(stacked.slope).all():
-        index = problem.free[int(np.argmin(np.isfinite(stacked.slope).all(axis=(0, 1))))]
+    elif not slope.all():
+        index = problem.free[int(np.argmin(slope.all(axis=(0, 1))))]
         culprit = f"as soon as parameter number {index + 1}, {p[index]:.4g}, changes"
     else:
         return

@@ -289,6 +289,9 @@ def test_what_cannot_be_fitted_is_refused() -> None:
         minimise(problem(1, residual=lost, linear=False), np.array([6.0, 1.0, 2.0]))
     with np.errstate(invalid="ignore"), pytest.raises(InputError, match="parameter number 1, 5"):
         minimise(problem(1, residual=lost, linear=False), np.array([5.0, 1.0, 2.0]))
+    run_away = problem(1, residual=lambda k, p: 1e180 * inner.residual(k, p))
+    with pytest.raises(InputError, match="no finite force"):
+        minimise(run_away, TRUTH)
 
 
 def test_the_low_pass_ends_at_a_fifth_of_a_low_sampling_rate():
