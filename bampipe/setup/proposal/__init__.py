@@ -98,13 +98,13 @@ def propose(
         chosen = new_device(folder, match, notes)
     elif (robot := chosen.device.robot) is not None:
         columns = find_robot_columns(folder, chosen.device, robot, found, clock.t, notes)
-        match.robot = columns
+        match.robot, match.given = columns, columns.columns
         chosen = _with_guessed_motors(folder, chosen, match)
         if columns.mounting is not None and columns.mounting.hangs:
             chosen = _hang(folder, chosen, columns.mounting, notes)
         chosen = _check_robot(chosen, robot, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
-    inputs = input_tables(chosen, axes, match, notes)
+    inputs = input_tables(chosen.device, axes, match, notes)
     if len(match.rivals) > 1 and len(chosen.device.coordinates) == 1:
         measured = join_names(column.name for column in axes.values())
         notes.check.append(

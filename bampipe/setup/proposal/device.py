@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,13 +57,11 @@ class ChosenDevice:
     Attributes:
         name: of a built-in device, or the path of a device file relative to the folder of logs.
         text: of a new device file, "" where there is one already.
-        columns: what the inputs of a new device were made from, by the name of the input.
     """
 
     name: str
     device: Device
     text: str = ""
-    columns: Mapping[str, SurveyedColumn] = field(default_factory=dict)
 
 
 def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None:
@@ -243,8 +241,11 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     match.geared = position.name if springs and _may_be_geared(position) else ""
     weight, on_gravity = weight_of(position, fit, linear, found, bool(match.geared))
     name = position.name.removesuffix(f" [{read.stated}]")
-    starter = starter_device(name, linear, drive, fit, weight, width)
-    match.given = {starter.axis: read}
+    text = starter_device(name, linear, drive, fit, weight, width)
+    device = registry.device_from(tomllib.loads(text), DEVICE)
+    axis, placeholders = device.coordinates[0].name, list(device.constants)
+    known = {axis: read, "supply": supply, device.forces[0]: driver}
+    match.given = {name: column for name, column in known.items() if column is not None}
     if match.turning and role == "force" and driver is not None and "motor" in words(driver.name):
         notes.check.append(
             f"{driver.name} is the torque of a motor, by its name: for that of the joint put the"
@@ -256,22 +257,15 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         doubt = "" if set(words(position.name)) & SLIDING else _MAY_TURN.format(position.name)
     what = "torque" if role == "force" and not linear else role
     notes.check.append(
-        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {what}{doubt}; put in what you"
-        " know of it"
+        f"{DEVICE}: one {kind} axis '{axis}' driven by a {what}{doubt}; put in what you know of it"
     )
-    if starter.placeholders:
-        are, them = ("are", "them") if len(starter.placeholders) > 1 else ("is", "it")
-        said = f"{join_names(starter.placeholders)} {are} not yours yet"
+    if placeholders:
+        are, them = ("are", "them") if len(placeholders) > 1 else ("is", "it")
+        said = f"{join_names(placeholders)} {are} not yours yet"
         notes.check.append(f"{DEVICE}: {said}: all forces and inertias scale with {them}")
     if on_gravity:
-        notes.check.append(f"{DEVICE}: on '{starter.axis}', {on_gravity}")
-    columns = {"supply": supply, starter.input: driver}
-    return ChosenDevice(
-        DEVICE,
-        registry.device_from(tomllib.loads(starter.text), DEVICE),
-        starter.text,
-        {name: column for name, column in columns.items() if column is not None},
-    )
+        notes.check.append(f"{DEVICE}: on '{axis}', {on_gravity}")
+    return ChosenDevice(DEVICE, device, text)
 
 
 def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bool:

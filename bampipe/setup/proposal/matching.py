@@ -53,9 +53,8 @@ class Matcher:
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
-        known = {**self.robot.columns, **self.given}
-        if name in known:
-            return known[name]
+        if name in self.given:
+            return self.given[name]
         wanted, numbers = set(words(name)), set(_numbers(name))
         for column in self.found.of(*roles):
             counted = set(_numbers(column.name))
@@ -117,8 +116,8 @@ class Matcher:
 
     def _input(self, name: str, si: str, axes: tuple[SurveyedColumn, ...]) -> Match:
         role = _INPUT_ROLE.get(si, "")
-        if name in self.robot.columns:
-            return self.robot.columns[name], ""
+        if name in self.given:
+            return self.given[name], ""
         free = [c for c in self.found.columns if c.name not in self.used]
         exact = next((c for c in free if c.name == name), None)
         named = exact or self.named(name, role) or self.named(name.removeprefix("force_"), role)

@@ -14,7 +14,6 @@ from bampipe.data.units import bare, spelled, unit
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
-from bampipe.setup.proposal.device import ChosenDevice
 from bampipe.setup.proposal.matching import Match, Matcher
 from bampipe.setup.proposal.notes import UNITS, UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
@@ -347,13 +346,11 @@ def _velocity_beside(axis: Coordinate, alone: bool, match: Matcher, notes: Notes
 
 
 def input_tables(
-    chosen: ChosenDevice, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
+    device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
 ) -> list[str]:
     """Propose the column of every input; the lines of those tables that have something to say."""
-    device = chosen.device
     wanted = {**dict.fromkeys(device.forces, device.force_unit), **device.channels}
     given = match.inputs(wanted, tuple(axes.values()))
-    given |= {name: (c, "") for name, c in chosen.columns.items() if name in wanted}
     lines = []
     sensed = all(name.startswith("force_") for name in device.forces)
     forces = [column for name in device.forces if (column := given[name][0]) is not None]
