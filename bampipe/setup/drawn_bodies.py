@@ -22,6 +22,9 @@ Bounds = tuple[float, float]
 
 WIDE: Bounds = (-np.inf, np.inf)
 """Range of the share of a drive whose sign and unit are not stated."""
+STATED: Bounds = (1.0 / 3.0, 3.0)
+"""Plausible ratios of the actual to the drawn weight on a joint; a drive beyond them is that of a
+motor before its gear, or has another unit."""
 _SURE = 5.0
 """Standard errors beyond which the sign of a drive is certain."""
 _LEAST_LEFT = 3e-3

@@ -12,7 +12,7 @@ from bampipe.physics import System
 from bampipe.physics.robot import Robot
 from bampipe.setup import hypotheses
 from bampipe.setup.drawn_bodies import (
-    Bounds,
+    STATED,
     Comparison,
     Drive,
     JointMotion,
@@ -38,8 +38,6 @@ from bampipe.trials.signals import Change
 
 DRAWN_SAMPLES = 4_000
 """Samples of all trials together that are compared with the drawn bodies."""
-_STATED: Bounds = (1.0 / 3.0, 3.0)
-"""Plausible ratios of the actual to the drawn weight on a joint."""
 _SUSPICIOUS = 0.15
 """Error with drawn bodies above which other set-ups are tried: two exchanged joints leave at least
 0.26."""
@@ -235,7 +233,7 @@ class DrawnSearch(Search):
             yield hypotheses.nearest_scale_correction(self.signals, forces, factor)
             return
         for name, size in sizes.items():
-            if abs(size) > np.log(_STATED[1]):
+            if abs(size) > np.log(STATED[1]):
                 yield hypotheses.nearest_scale_correction(self.signals, [name], np.exp(-size))
 
     def _compare(self, change: Change, stated: Comparison) -> Comparison | None:
@@ -269,7 +267,7 @@ class DrawnSearch(Search):
         gravity = np.array(change.gravity or compared.robot.gravity)
         mounting = Mounting(np.ones(n), change.offset[:n], gravity, change.gravity is not None)
         with np.errstate(all="ignore"):
-            drives = compared.hold(mounting, _STATED)
+            drives = compared.hold(mounting, STATED)
         if not np.isfinite([drive.left for drive in drives]).all():
             return None
         return compared, mounting, drives

@@ -129,9 +129,7 @@ class Search:
     tested: int = field(default=0, init=False)
     over_position: Plausibility | None = field(default=None, init=False)
     heavier: HeavierBody | None = field(default=None, init=False)
-    _judged: dict[tuple[int, ...], tuple[Plausibility | None, Corrections]] = field(
-        default_factory=dict, init=False
-    )
+    _judged: dict[Corrections, Plausibility | None] = field(default_factory=dict, init=False)
 
     def together(self, chosen: Corrections) -> Corrections:
         """Return corrections that explain more only together; none by default."""
@@ -286,11 +284,9 @@ class Search:
 
     def judge(self, corrections: Corrections) -> Plausibility | None:
         """Return the plausibility of a set-up on the trials; None if it cannot be computed."""
-        key = tuple(id(one) for one in corrections)
-        if key not in self._judged:
-            found = self._judge(corrections, (self.motions, self.folds), 12)
-            self._judged[key] = found, corrections
-        return self._judged[key][0]
+        if corrections not in self._judged:
+            self._judged[corrections] = self._judge(corrections, (self.motions, self.folds), 12)
+        return self._judged[corrections]
 
     def _judge(
         self, corrections: Corrections, trials: Trials, steps: int, posed: Sequence[int] = ()

@@ -20,6 +20,7 @@ from bampipe.files import write_text
 from bampipe.lists import join_names
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
+from bampipe.setup.drawn_bodies import STATED
 from bampipe.setup.mounting import Mounting
 from bampipe.setup.proposal.device import (
     DEVICE,
@@ -33,7 +34,7 @@ from bampipe.setup.proposal.device import (
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
-from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
+from bampipe.setup.proposal.robot import RobotColumns, find_robot_columns
 from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
 
 SESSION = "session.toml"
@@ -189,10 +190,10 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> 
         reference = max(size, key=lambda name: size[name])
         scale_sd[reference] = f", scale_sd = {robot.uncertainty}"
         return with_motors(folder, chosen, guessed, reference.removeprefix("current_"))
-    if columns.gears and all(LEAST_AT_JOINT < size < 1.0 / LEAST_AT_JOINT for size in of_motor):
+    if columns.gears and all(STATED[0] < size < STATED[1] for size in of_motor):
         scale_sd |= dict.fromkeys(columns.drives, _GUESSED_GEAR)
         return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
-    if not columns.gears and all(size < LEAST_AT_JOINT for size in sizes):
+    if not columns.gears and all(size < STATED[0] for size in sizes):
         gears = {j: (1.0 / size, None) for j, size in zip(joints, sizes, strict=True)}
         scale_sd |= dict.fromkeys(columns.drives, f", scale_sd = {robot.uncertainty}")
         return with_motors(folder, chosen, gears)

@@ -15,6 +15,7 @@ from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
 from bampipe.setup.drawn_bodies import (
+    STATED,
     Comparison,
     Drive,
     JointMotion,
@@ -43,8 +44,6 @@ _SURE_LEFT = 0.02
 """Of the drives' variance: what the right reductions leave at most where zeros are guessed, too."""
 _ALTERNATIONS = 2
 """How often zeros are sought with the reductions found so far, and reductions with these zeros."""
-LEAST_AT_JOINT = 1.0 / 3.0
-"""Share of what the drawing requires below which a torque is that of a motor."""
 _BETTER = 0.5
 """Of what one order of the joints leaves unexplained: another one must leave less."""
 PUT_IN = (
@@ -403,9 +402,9 @@ def _sentences(
             said.append(f"its sign is turned; or that of {c.name} is the wrong one")
         if device.force_unit == "A":
             agreed.append(f"{c.name} {1.0 / size:.3g} N.m/A")
-        elif size >= 1.0 / LEAST_AT_JOINT:
+        elif size >= STATED[1]:
             said.append("another unit, or bodies that are not drawn")
-        elif size <= LEAST_AT_JOINT:
+        elif size <= STATED[0]:
             said.append(
                 f"another unit, or the torque of a motor with a reduction of about {1.0 / size:.3g}"
             )
