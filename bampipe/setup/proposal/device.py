@@ -23,7 +23,6 @@ from bampipe.physics.device import KINDS, Device
 from bampipe.setup.hypotheses import MOST_TRAVEL
 from bampipe.setup.proposal.joints import chain_logged
 from bampipe.setup.proposal.matching import Matcher
-from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import (
     SLIDING,
     in_counts,
@@ -200,14 +199,14 @@ def _built_in(found: Survey) -> ChosenDevice | None:
     return None
 
 
-def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
+def new_device(folder: Path, match: Matcher) -> ChosenDevice:
     """Propose a device file for one axis, with priors by a rough fit to the first log.
 
     Raises:
         InputError: no column looks like a position.
     """
-    found = match.found
-    position = match.position("", 1, notes)
+    found, notes = match.found, match.notes
+    position = match.position("")
     if position is None:
         way = "say in order what they are: bampipe init FOLDER --names t,angle_deg,..."
         if not is_text(found.trials[0].file):
@@ -220,7 +219,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     linear = slides(position, found)
     driver, role = match.driver(position)
     supply = match.supply(driver) if role == "duty" else None
-    coil = role == "force" and _has_coil(driver, match, notes)
+    coil = role == "force" and _has_coil(driver, match)
     read, position = (position, position) if linear else _at_joint(position, driver, match)
     fit = _rough_fit(position, driver, role, linear, match.t)
     if driver is not None and fit.feeds:
@@ -268,7 +267,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     return ChosenDevice(DEVICE, device, text)
 
 
-def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bool:
+def _has_coil(driver: SurveyedColumn | None, match: Matcher) -> bool:
     """Whether a current beside a force is that of a coil or a brake, rather than of the drive."""
     found = (c for c in match.found.of("current") if not c.is_constant)
     currents = [c for c in found if "motor" not in words(c.name)]
@@ -279,12 +278,12 @@ def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bo
     alike = [c for c, same in zip(currents, together, strict=True) if same]
     for current in alike:
         match.used.add(current.name)
-        notes.check.append(
+        match.notes.check.append(
             f"{current.name} goes with {driver.name}: both are of the drive, and {driver.name} is"
             " taken; either would do"
         )
     coils = [c.name for c in currents if c.name not in match.used]
-    notes.check += [
+    match.notes.check += [
         f"{name} is taken for the current in the coil of a brake or damper; it is a commanded"
         " value, since no measured current was found"
         for name in coils

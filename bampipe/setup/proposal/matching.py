@@ -30,6 +30,7 @@ class Matcher:
         t: (T,) time stamps of the first log, s.
         used: names of the columns that have a meaning already; grows as tables are proposed.
         registers: columns that hold signed numbers in a register, and how.
+        notes: what a person has to look at; axes: number of those of the device.
         robot: columns of a robot of which the drawing tells, and how they are counted.
         turning: what the readings of a position are worth, by the weight on it, by name of column.
         given: columns that are known, by name of axis or input.
@@ -43,6 +44,8 @@ class Matcher:
     t: np.ndarray
     used: set[str]
     registers: Mapping[str, Register]
+    notes: Notes
+    axes: int = 1
     robot: RobotColumns = field(default_factory=RobotColumns)
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
     given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
@@ -63,13 +66,10 @@ class Matcher:
                 return column
         return None
 
-    def position(self, axis: str, axes: int, notes: Notes) -> SurveyedColumn | None:
-        """The measured position of an axis, "" for any; a guess is noted if it is one of several.
-
-        Of several ``axes``, only the name tells which is which.
-        """
+    def position(self, axis: str) -> SurveyedColumn | None:
+        """The measured position of an axis, "" for any; of several axes, only the name tells."""
         named = self.named(axis, "position") if axis else None
-        if named is not None or axes > 1:
+        if named is not None or self.axes > 1:
             return named
         moving = [c for c in self.found.columns if not c.is_constant]
         found = [c for c in moving if c.role == "position"]
