@@ -44,8 +44,6 @@ SUSPICIOUS_PRIORS = 5.0
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """Smallest mistakes: a factor, an angle (rad) and a fraction of an axis' travel. Anything smaller
 is an effect to be diagnosed."""
-_VARIED = 0.2
-"""Smallest relative standard deviation of a drive that varies."""
 MOST_AXES = 3
 """With more axes, only signs, the clock, and units of all axes or inputs together are tried: the
 number of exchanges, shifts and scales grows too fast for fits of a robot's bodies."""
@@ -379,15 +377,7 @@ def gear_families(signals: Signals, axis: str, travel: float) -> Iterator[tuple[
 
 
 def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signals) -> bool:
-    """Whether a scale or zero is wrong by more than an effect would explain.
-
-    An exchange must leave drives that vary, since an offset explains any constant one.
-    """
-    others = [name for name in correction.signals if name not in signals.axes]
-    if correction.kind == "exchange" and 0 < len(others) < len(correction.signals):
-        changed = [correction.change.of_motion(motion, signals) for motion in motions]
-        drives = (np.concatenate([m.channels[name] for m in changed]) for name in others)
-        return all(np.std(drive) > _VARIED * np.sqrt(np.mean(drive**2)) for drive in drives)
+    """Whether a scale or zero is wrong by more than an effect would explain."""
     if correction.kind == "scale":
         return abs(math.log(correction.factor)) > math.log(LEAST_FACTOR)
     if correction.kind != "zero":
