@@ -162,10 +162,6 @@ def load_filter_trial(
         if name not in columns and name != "t" and name not in brakes.values():
             columns[name] = np.interp(t, motion.t, motion.inputs(system.inputs)[:, place])
     u = input_columns(columns, system.inputs, brakes)
-    for column in u.T:
-        lost = np.isnan(column)
-        if lost.any():
-            column[lost] = np.interp(t[lost], t[~lost], column[~lost])
     y = np.column_stack([columns[f"q_{axis}"] for axis in system.coordinates])
     if choice.measure == "position_velocity":
         velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]

@@ -274,10 +274,7 @@ def _read_trial(run: RunFolder, trial_id: str, system: System) -> Trial:
     t = columns["t"]
     u = input_columns(columns, system.inputs, system.model.device.brakes)
     y = np.column_stack([columns[f"q_{axis}"] for axis in system.coordinates])
-    first = int(np.flatnonzero(np.isfinite(y).all(axis=1) & np.isfinite(u).all(axis=1))[0])
-    for column in u.T:
-        lost = np.isnan(column)
-        column[lost] = np.interp(t[lost], t[~lost], column[~lost])
+    first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
     return Trial(t[first:], u[first:], y[first:], np.zeros(0), np.zeros(0))
 
 

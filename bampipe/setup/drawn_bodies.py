@@ -14,14 +14,17 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares
 
-from bampipe.arrays import Array, Flags
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.physics.robot import Robot
-from bampipe.setup.mounting import Mounting
+from bampipe.setup.mounting import Mounting, find_mounting
 
 Bounds = tuple[float, float]
 
 WIDE: Bounds = (-np.inf, np.inf)
 """Range of the share of a drive whose sign and unit are not stated."""
+STATED: Bounds = (1.0 / 3.0, 3.0)
+"""Plausible ratios of the actual to the drawn weight on a joint; a drive beyond them is that of a
+motor before its gear, or has another unit."""
 _SURE = 5.0
 """Standard errors beyond which the sign of a drive is certain."""
 _LEAST_LEFT = 3e-3
@@ -87,6 +90,10 @@ class JointMotion:
     position: Array
     rate: Array
     change: Array
+
+    def rows(self, rows: slice | Indices) -> JointMotion:
+        """The motion at some samples."""
+        return JointMotion(self.position[rows], self.rate[rows], self.change[rows])
 
     def reread(self, gain: Array, time: float = 1.0) -> JointMotion:
         """Motion of joints that are ``gain`` (n, n) times these, by a clock ``time`` slower."""
@@ -202,20 +209,18 @@ class Comparison:
         """Losses of each drive; the sign is that of the joint, whichever way the motor turns."""
         found = []
         for k, way in enumerate(np.sign(self.ratio)):
-            turns = [way * np.eye(len(self.ratio))[k], *(t for t in self.shared if t[k])]
-            columns, powers = [], np.zeros(3 * len(turns))
-            widest = [
-                _TURNING * max(np.abs(motion.rate @ by).max() for motion in self.motions)
-                for by in turns
+            own = way * np.eye(len(self.ratio))[k]
+            turns = np.column_stack([own, *(shared for shared in self.shared if shared[k])])
+            rates = [motion.rate @ turns for motion in self.motions]
+            width = np.maximum(_TURNING * np.abs(np.concatenate(rates)).max(axis=0), 1e-9)
+            columns = [
+                np.hstack([motion.change @ turns, rate, np.tanh(rate / width)])
+                for motion, rate in zip(self.motions, rates, strict=True)
             ]
-            for motion in self.motions:
-                changes, rates = ([x @ by for by in turns] for x in (motion.change, motion.rate))
-                signs = [np.tanh(r / max(w, 1e-9)) for r, w in zip(rates, widest, strict=True)]
-                columns.append(np.column_stack([*changes, *rates, *signs]))
-            thinned, m = self._thinned(columns, k), len(turns)
-            rate, sign = thinned[:, m : 2 * m], thinned[:, 2 * m :]
-            powers[m : 2 * m] = np.mean(rate**2, axis=0) if len(rate) else 0.0
-            powers[2 * m :] = np.mean(sign * rate, axis=0) if len(rate) else 0.0
+            thinned = self._thinned(columns, k)
+            _, rate, sign = np.split(thinned, 3, axis=1)
+            means = [part.sum(axis=0) / max(len(part), 1) for part in (rate**2, sign * rate)]
+            powers = np.concatenate([np.zeros(turns.shape[1]), *means])
             found.append(
                 Losses.of(thinned, powers, self._rows(self.drives[:, k], k), self.has_offset)
             )
@@ -237,6 +242,16 @@ class Comparison:
             loss.beside(sums, by_part, mounting.direction[k], bounds)
             for k, (loss, sums) in enumerate(zip(self.losses, self._sums[key], strict=True))
         ]
+
+    def best_mounting(self, roughly: Comparison, doubted: float) -> Mounting:
+        """Return the mounting with which the drawing explains most of ``roughly`` the same.
+
+        It is the nominal one if that leaves less than the fraction ``doubted`` of every drive.
+        """
+        nominal = self.nominal
+        if max(drive.left for drive in self.hold(nominal)) < doubted:
+            return nominal
+        return find_mounting(roughly.turning, nominal, roughly.misfit)
 
     def misfit(self, mounting: Mounting) -> float:
         """The quantity that `find_mounting` minimises; friction that contradicts weight adds."""

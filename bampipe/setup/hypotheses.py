@@ -34,9 +34,11 @@ CLOCKS = (1e-3, 1e3, 1e-6, 1e6, 1e-9, 1e9)
 USUAL = ("deg", "mm", "mN", "kN", "mA", "mV", "mN.m", "kN.m", "kgf")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Correction:
     """A mistake in a set-up, with the change of the signals that corrects it.
+
+    Two are the same only if they are one object.
 
     Attributes:
         kind: of the mistake; signals: those it concerns, none for a clock.

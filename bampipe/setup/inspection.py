@@ -4,6 +4,7 @@ import ast
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility, distance_from_prior
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
 from bampipe.setup.search import EXPLAINED, MOST_TRIALS, Finding, Search, shorten, spoilt_axes
-from bampipe.setup.turned_trials import TurnedTrial, find_turned_trials
+from bampipe.setup.turned_trials import find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
@@ -55,23 +56,23 @@ def inspect_setup(
 
     def search_in(motions: Sequence[Motion]) -> tuple[Search, Plausibility | None]:
         short = shorten([motions[k] for k in chosen])
-        search = Search(system, short, band, part, signals)
+        search = Search(system, short, band, part, signals, ones)
         held = search.judge(())
         if is_drawn(system):
-            search = DrawnSearch(system, shorten(short, DRAWN_SAMPLES), band, part, signals)
+            short = shorten(short, DRAWN_SAMPLES)
+            search = DrawnSearch(system, short, band, part, signals, ones)
         return search, held
 
     search, held = search_in(motions)
     # Reversed signs in some trials come first: in all trials together they look like others.
     odd = find_turned_trials(system, motions, band, folds, signals)
     if odd:
-        changes = {one.place: one.corrections[0].change for one in odd}
         motions = [
-            changes[k].of_motion(motion, signals) if k in changes else motion
+            odd[k].correction.change.of_motion(motion, signals) if k in odd else motion
             for k, motion in enumerate(motions)
         ]
         search, _ = search_in(motions)
-    findings = search.find_mistakes(ones)
+    findings = search.find_mistakes()
     mistakes = (
         *_record_turned(system, session, odd, names),
         *(_record(system, session, found, placeholders) for found in findings),
@@ -183,23 +184,23 @@ def _record(
 
 
 def _record_turned(
-    system: System, session: IngestResult, odd: Sequence[TurnedTrial], names: Sequence[str]
+    system: System, session: IngestResult, odd: Mapping[int, Finding], names: Sequence[str]
 ) -> Iterator[SetupMistake]:
     """Record trials with a sign of their own; those with the same sign are one mistake."""
-    alike: dict[tuple[tuple[str, ...], ...], list[TurnedTrial]] = {}
-    for each in odd:
-        alike.setdefault(tuple(one.signals for one in each.corrections), []).append(each)
+    alike: dict[tuple[tuple[str, ...], ...], list[int]] = {}
+    for k, found in odd.items():
+        either = found.correction, *found.rivals
+        alike.setdefault(tuple(one.signals for one in either), []).append(k)
     for any_of, trials in alike.items():
-        first, many = trials[0], len(trials) > 1
+        many = len(trials) > 1
         said = f"{' or '.join(map(join_names, any_of))} {'have' if len(any_of[0]) > 1 else 'has'}"
         its, entry, them = ("their", "entries", "them") if many else ("its", "entry", "the trial")
         sentence = (
-            f"{join_names(names[one.place] for one in trials)}: {said} another sign than in the"
+            f"{join_names(names[k] for k in trials)}: {said} another sign than in the"
             f" other trials: put negated = {json.dumps(any_of[0])} into {its} [[trials]] {entry},"
             f" or leave {them} out"
         )
-        found = Finding(first.corrections[0], (), first.before, first.after, 0.0)
-        record = _record(system, session, found, {})
+        record = _record(system, session, replace(odd[trials[0]], rivals=()), {})
         yield record.model_copy(update={"sentence": sentence})
 
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.physics import System
 from bampipe.physics.parameter import Parameter
 from bampipe.trials.folds import Folds
@@ -136,22 +136,17 @@ def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:
 
 def _errors_with_pose(linearisation: Linearisation, posed: Sequence[int]) -> Array:
     """Errors (n_q,) of the fit with an additional torque over position on the axes ``posed``."""
-    count = len(linearisation.free)
-    wide = np.full(4 * len(posed), np.inf)
     columns = [
         np.concatenate([slopes, _pose_columns(linearisation, k, posed)], axis=2)
         for k, slopes in enumerate(linearisation.jacobian)
     ]
-    root = np.sqrt(linearisation.weight)[:, None]
-    fitted = linearisation.folds.fitted_trials
-    design = np.concatenate([(root * columns[k]).reshape(-1, count + wide.size) for k in fitted])
-    target = np.concatenate([(linearisation.residual[k] * root[:, 0]).ravel() for k in fitted])
-    scale = np.maximum(np.linalg.norm(design, axis=0), np.finfo(float).tiny)
+    residual, used, no_prior = linearisation.residual, linearisation.used, np.zeros(0)
+    sums = NormalEquations.from_samples(columns, residual, used, no_prior, no_prior)
+    wide = np.full(4 * len(posed), np.inf)
     lower, upper = np.append(linearisation.lower, -wide), np.append(linearisation.upper, wide)
-    step = lsq_linear(design / scale, -target, (lower * scale - 1e-12, upper * scale + 1e-12)).x
-    left = [r + c @ (step / scale) for r, c in zip(linearisation.residual, columns, strict=True)]
-    used = np.maximum(np.concatenate(linearisation.used).sum(axis=0), 1.0)
-    return np.asarray(np.sqrt(np.sum(np.concatenate(left) ** 2, axis=0) / used))
+    fitted = sums.subset(linearisation.folds.fitted_trials)
+    step = fitted.solve(linearisation.weight, lower, upper)
+    return np.asarray(np.sqrt(sums.mean_square(step)))
 
 
 def _pose_columns(linearisation: Linearisation, trial: int, posed: Sequence[int]) -> Array:

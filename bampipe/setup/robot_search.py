@@ -12,7 +12,7 @@ from bampipe.physics import System
 from bampipe.physics.robot import Robot
 from bampipe.setup import hypotheses
 from bampipe.setup.drawn_bodies import (
-    Bounds,
+    STATED,
     Comparison,
     Drive,
     JointMotion,
@@ -21,7 +21,7 @@ from bampipe.setup.drawn_bodies import (
     with_heavier_body,
 )
 from bampipe.setup.hypotheses import Correction
-from bampipe.setup.mounting import Mounting, find_mounting
+from bampipe.setup.mounting import Mounting
 from bampipe.setup.plausibility import FARTHEST, WEIGHT, Plausibility
 from bampipe.setup.search import (
     DECADES,
@@ -38,8 +38,6 @@ from bampipe.trials.signals import Change
 
 DRAWN_SAMPLES = 4_000
 """Samples of all trials together that are compared with the drawn bodies."""
-_STATED: Bounds = (1.0 / 3.0, 3.0)
-"""Plausible ratios of the actual to the drawn weight on a joint."""
 _SUSPICIOUS = 0.15
 """Error with drawn bodies above which other set-ups are tried: two exchanged joints leave at least
 0.26."""
@@ -88,10 +86,7 @@ class DrawnSearch(Search):
     def roughly(self) -> Comparison:
         """`stated` at thinned samples only: joints move more slowly than the band's cut-off."""
         kept = [self.band.thinned_rows(len(motion.t)) for motion in self.motions]
-        motions = [
-            JointMotion(m.position[rows], m.rate[rows], m.change[rows])
-            for m, rows in zip(self.stated.motions, kept, strict=True)
-        ]
+        motions = [m.rows(rows) for m, rows in zip(self.stated.motions, kept, strict=True)]
         return replace(self.stated, motions=motions, thin=keep, _required={})
 
     @cached_property
@@ -147,20 +142,15 @@ class DrawnSearch(Search):
     @cached_property
     def _by_force(self) -> Array:
         """Joint forces per unit of each force of the device, (n, forces)."""
-        n, inputs = len(self.system.coordinates), len(self.system.inputs)
-        at, p = (np.zeros((inputs + 1, n)),) * 3, self.system.prior
-        u = np.vstack([np.zeros(inputs), np.eye(inputs)])
-        z = self.system.memory(*at, u, p, np.arange(inputs + 1.0))
-        found = self.system.applied(*at, z, u, p)
-        places = [self.system.inputs.index(name) for name in self.signals.forces]
-        return np.asarray((found[1:] - found[0])[places].T)
+        poses = np.zeros((1, len(self.system.coordinates)))
+        return np.asarray(self.system.input_map(poses)[0])
 
     def screen(self, chosen: Corrections, correction: Correction) -> float:
         # Signs and sizes of drives of a single joint are free here: `together` reads their shares.
         held = self._hold((*chosen, correction), self.roughly)
         return np.inf if held is None else held[0].misfit(held[1]) + 2.0 * correction.cost / WEIGHT
 
-    def is_suspicious(self, now: Plausibility | None, placeholders: Sequence[str] = ()) -> bool:
+    def is_suspicious(self, now: Plausibility | None) -> bool:
         if now is None:
             return False
         return now.worst_error > _SUSPICIOUS or float(now.objections.sum()) > LEAST_GAIN
@@ -206,9 +196,7 @@ class DrawnSearch(Search):
         compared, rough = (self._compare(change, one) for one in (self.stated, self.roughly))
         if compared is None or rough is None:
             return ()
-        mounting = compared.nominal
-        if max(drive.left for drive in compared.hold(mounting)) > _SUSPICIOUS**2:
-            mounting = find_mounting(rough.turning, rough.nominal, rough.misfit)
+        mounting = compared.best_mounting(rough, _SUSPICIOUS**2)
         for k, (axis, (direction, zero)) in enumerate(
             zip(self.signals.axes, mounting.by_joint, strict=True)
         ):
@@ -245,7 +233,7 @@ class DrawnSearch(Search):
             yield hypotheses.nearest_scale_correction(self.signals, forces, factor)
             return
         for name, size in sizes.items():
-            if abs(size) > np.log(_STATED[1]):
+            if abs(size) > np.log(STATED[1]):
                 yield hypotheses.nearest_scale_correction(self.signals, [name], np.exp(-size))
 
     def _compare(self, change: Change, stated: Comparison) -> Comparison | None:
@@ -279,7 +267,7 @@ class DrawnSearch(Search):
         gravity = np.array(change.gravity or compared.robot.gravity)
         mounting = Mounting(np.ones(n), change.offset[:n], gravity, change.gravity is not None)
         with np.errstate(all="ignore"):
-            drives = compared.hold(mounting, _STATED)
+            drives = compared.hold(mounting, STATED)
         if not np.isfinite([drive.left for drive in drives]).all():
             return None
         return compared, mounting, drives

@@ -44,8 +44,6 @@ SUSPICIOUS_PRIORS = 5.0
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """Smallest mistakes: a factor, an angle (rad) and a fraction of an axis' travel. Anything smaller
 is an effect to be diagnosed."""
-_VARIED = 0.2
-"""Smallest relative standard deviation of a drive that varies."""
 MOST_AXES = 3
 """With more axes, only signs, the clock, and units of all axes or inputs together are tried: the
 number of exchanges, shifts and scales grows too fast for fits of a robot's bodies."""
@@ -88,12 +86,6 @@ def drop_correction(corrections: Corrections, one: Correction) -> Corrections:
     return tuple(other for other in corrections if other is not one)
 
 
-def least_gain(correction: Correction, placeholders: Sequence[str] = ()) -> float:
-    """Smallest gain of score at which a correction counts."""
-    hinted = correction.kind == "scale" and set(correction.signals) <= set(placeholders)
-    return LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN
-
-
 def spoilt_axes(finding: Finding) -> list[int]:
     """Axes whose error falls by more than a third by the correction; all axes if there are none."""
     before, after = finding.before.error, finding.after.error
@@ -120,6 +112,7 @@ class Search:
 
     Attributes:
         motions: the trials as stated, shortened; tested: number of set-ups tried.
+        placeholders: signals whose scale is exactly 1.
         heavier: the only body that is far heavier than drawn; None if there is none.
         over_position: plausibility of the stated set-up with a torque over position that the
             device lacks, if this rather than a mistake explains the error; otherwise None.
@@ -130,12 +123,11 @@ class Search:
     band: Band
     folds: Folds
     signals: Signals
+    placeholders: Sequence[str] = ()
     tested: int = field(default=0, init=False)
     over_position: Plausibility | None = field(default=None, init=False)
     heavier: HeavierBody | None = field(default=None, init=False)
-    _judged: dict[tuple[int, ...], tuple[Plausibility | None, Corrections]] = field(
-        default_factory=dict, init=False
-    )
+    _judged: dict[Corrections, Plausibility | None] = field(default_factory=dict, init=False)
 
     def together(self, chosen: Corrections) -> Corrections:
         """Return corrections that explain more only together; none by default."""
@@ -145,39 +137,31 @@ class Search:
         """Return corrections, of those ``tried``, that may do as well as the chosen ones."""
         return tried
 
-    def find_mistakes(self, placeholders: Sequence[str] = ()) -> tuple[Finding, ...]:
-        """Return the mistakes of the set-up, the largest gain first.
-
-        ``placeholders`` are signals whose scale is exactly 1.
-        """
+    def find_mistakes(self) -> tuple[Finding, ...]:
+        """Return the mistakes of the set-up, the largest gain first."""
         chosen: Corrections = ()
         tried: list[Correction] = []
-        while len(chosen) < MOST_MISTAKES and self.is_suspicious(self.judge(chosen), placeholders):
+        while len(chosen) < MOST_MISTAKES and self.is_suspicious(self.judge(chosen)):
             singles = self._shortlist(chosen, self.discrete())
             options = [*((one,) for one in singles), self.together(chosen)]
-            best = self._best(chosen, options, placeholders)
+            best = self._best(chosen, options)
             if self.is_suspicious(self.judge((*chosen, *best))):
                 singles += self._continuous(chosen)
                 with_first = self.together((*chosen, *singles[:1]))
                 options += [*((one,) for one in singles), (*singles[:1], *with_first)]
-                best = self._best(chosen, options, placeholders)
+                best = self._best(chosen, options)
             if (not chosen and self.lacks_pose(best)) or not best:
                 break
             tried += singles
             chosen = (*chosen, *self._with_refined_factor(chosen, best))
-        return self.confirm(chosen, self.rivals(tried), placeholders)
+        return self.confirm(chosen, self.rivals(tried))
 
-    def confirm(
-        self, chosen: Corrections, others: Sequence[Correction], placeholders: Sequence[str] = ()
-    ) -> tuple[Finding, ...]:
+    def confirm(self, chosen: Corrections, others: Sequence[Correction]) -> tuple[Finding, ...]:
         """Return the mistakes among corrections ``chosen`` together, the largest gain first.
 
         Corrections without which the error hardly rises are dropped. There are no mistakes if some
-        axis remains unexplained, or is worse than as stated.
-
-        Args:
-            others: corrections that may replace a chosen one.
-            placeholders: signals whose scale is exactly 1.
+        axis remains unexplained, or is worse than as stated. ``others`` are corrections that may
+        replace a chosen one.
         """
         found: list[Finding] = []
         while chosen:
@@ -188,8 +172,8 @@ class Search:
             for one in chosen:
                 before = self.judge(drop_correction(chosen, one)) or after.with_nothing_explained()
                 found.append(Finding(one, (), before, after, gain_of(before, after, one.cost)))
-            idle = min(found, key=lambda f: f.gain - least_gain(f.correction, placeholders))
-            if idle.gain >= least_gain(idle.correction, placeholders):
+            idle = min(found, key=lambda f: f.gain - self.least_gain(f.correction))
+            if idle.gain >= self.least_gain(idle.correction):
                 break
             chosen = drop_correction(chosen, idle.correction)
         stated = self.judge(())
@@ -210,15 +194,18 @@ class Search:
         explained = all((f.after.left[spoilt_axes(f)] < EXPLAINED).all() for f in found)
         return tuple(found) if explained else ()
 
+    def least_gain(self, correction: Correction) -> float:
+        """Smallest gain of score at which a correction counts."""
+        hinted = correction.kind == "scale" and set(correction.signals) <= set(self.placeholders)
+        return LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN
+
     def score(self, corrections: Corrections) -> float:
         """Score of a set-up, lower being better; infinite if it cannot be computed."""
         found = self.judge(corrections)
         cost = sum(one.cost for one in corrections)
         return math.inf if found is None else found.score(RANKED_ERROR) + cost
 
-    def _best(
-        self, chosen: Corrections, options: Sequence[Corrections], placeholders: Sequence[str]
-    ) -> Corrections:
+    def _best(self, chosen: Corrections, options: Sequence[Corrections]) -> Corrections:
         """Return the best of the options that gain enough and spoil no axis."""
         before = self.judge(chosen)
         ranked = sorted(options, key=lambda option: self.score((*chosen, *option)))
@@ -228,7 +215,7 @@ class Search:
                 continue
             stated = before or after.with_nothing_explained()
             gain = gain_of(stated, after, sum(one.cost for one in option))
-            least = max(least_gain(one, placeholders) for one in option)
+            least = max(map(self.least_gain, option))
             if gain >= least and not spoils_sound_axes(stated, after):
                 return option
         return ()
@@ -295,11 +282,9 @@ class Search:
 
     def judge(self, corrections: Corrections) -> Plausibility | None:
         """Return the plausibility of a set-up on the trials; None if it cannot be computed."""
-        key = tuple(id(one) for one in corrections)
-        if key not in self._judged:
-            found = self._judge(corrections, (self.motions, self.folds), 12)
-            self._judged[key] = found, corrections
-        return self._judged[key][0]
+        if corrections not in self._judged:
+            self._judged[corrections] = self._judge(corrections, (self.motions, self.folds), 12)
+        return self._judged[corrections]
 
     def _judge(
         self, corrections: Corrections, trials: Trials, steps: int, posed: Sequence[int] = ()
@@ -335,11 +320,11 @@ class Search:
         self.over_position = found
         return True
 
-    def is_suspicious(self, now: Plausibility | None, placeholders: Sequence[str] = ()) -> bool:
+    def is_suspicious(self, now: Plausibility | None) -> bool:
         """Whether the error or the parameters are implausible enough to try other set-ups."""
         if now is None or now.error.max() > SUSPICIOUS_ERROR:
             return True
-        most = LEAST_GAIN_PLACEHOLDER if placeholders else SUSPICIOUS_PRIORS
+        most = LEAST_GAIN_PLACEHOLDER if self.placeholders else SUSPICIOUS_PRIORS
         return bool(now.objections.sum() > most)
 
     def discrete(self) -> Iterator[Correction]:
@@ -392,15 +377,7 @@ def gear_families(signals: Signals, axis: str, travel: float) -> Iterator[tuple[
 
 
 def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signals) -> bool:
-    """Whether a scale or zero is wrong by more than an effect would explain.
-
-    An exchange must leave drives that vary, since an offset explains any constant one.
-    """
-    others = [name for name in correction.signals if name not in signals.axes]
-    if correction.kind == "exchange" and 0 < len(others) < len(correction.signals):
-        changed = [correction.change.of_motion(motion, signals) for motion in motions]
-        drives = (np.concatenate([m.channels[name] for m in changed]) for name in others)
-        return all(np.std(drive) > _VARIED * np.sqrt(np.mean(drive**2)) for drive in drives)
+    """Whether a scale or zero is wrong by more than an effect would explain."""
     if correction.kind == "scale":
         return abs(math.log(correction.factor)) > math.log(LEAST_FACTOR)
     if correction.kind != "zero":

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +10,15 @@ from bampipe.physics import System
 from bampipe.setup.hypotheses import Correction, sign_correction
 from bampipe.setup.plausibility import Plausibility, judge_setup
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, is_drawn
-from bampipe.setup.search import ALIKE, LEAST_GAIN, MOST_AXES, SUSPICIOUS_ERROR, gain_of, shorten
+from bampipe.setup.search import (
+    ALIKE,
+    LEAST_GAIN,
+    MOST_AXES,
+    SUSPICIOUS_ERROR,
+    Finding,
+    gain_of,
+    shorten,
+)
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
@@ -19,35 +26,23 @@ from bampipe.trials.signals import Signals
 _STEPS, _SAMPLES = 4, 4000
 
 
-@dataclass(frozen=True)
-class TurnedTrial:
-    """A trial in which the readings of a signal have the opposite sign to the other trials.
-
-    Attributes:
-        place: number of the trial; corrections: alternatives, each of a signal or a robot's drives.
-        before, after: plausibility of the trial alone, as stated and corrected.
-    """
-
-    place: int
-    corrections: tuple[Correction, ...]
-    before: Plausibility
-    after: Plausibility
-
-
 def find_turned_trials(
     system: System, motions: Sequence[Motion], band: Band, folds: Folds, signals: Signals
-) -> list[TurnedTrial]:
+) -> dict[int, Finding]:
     """Find the minority of trials whose signs contradict the others, by inertia and friction.
 
     Each trial is fitted alone, so that parameters may differ between trials, as with different
     dampers. With many joints, the drawn bodies determine the signs.
+
+    Returns:
+        By number of the trial, the signs that are turned, and others that explain it as well.
     """
     fitted = folds.fitted_trials
     if len(fitted) < 2:
-        return []
+        return {}
     if len(system.coordinates) > MOST_AXES:
         if not is_drawn(system):
-            return []
+            return {}
         short = {k: shorten([motions[k]], DRAWN_SAMPLES) for k in fitted}
         return _find_by_drawn_bodies(
             {k: DrawnSearch(system, m, band, folds.subset([k]), signals) for k, m in short.items()}
@@ -65,7 +60,7 @@ def find_turned_trials(
 
     stated = {k: own for k in fitted if (own := fit(k)) is not None}
     if all(own.error.max() < SUSPICIOUS_ERROR for own in stated.values()):
-        return []
+        return {}
     drives = [name for name in signals.inputs if name not in signals.brakes]
     options = [sign_correction(signals, [name]) for name in (*signals.axes, *drives)]
     fits = {
@@ -81,26 +76,27 @@ def find_turned_trials(
         for k in min(against, along, key=len) if against and along else ():
             strength = float(np.mean([gains[j][place] for j in against]))
             found.setdefault(k, []).append((strength, place))
-    result = []
+    result = {}
     for k, ways in sorted(found.items()):
         most, place = max(ways, key=lambda way: way[0])
         before, after = stated[k], fits[k][place]
         if gains[k][place] < 0.0:  # the other trials are reversed, not this one
             before, after = after, before
         alike = [options[at] for strength, at in ways if strength > most - ALIKE and at != place]
-        result.append(TurnedTrial(k, (options[place], *alike), before, after))
+        result[k] = Finding(options[place], tuple(alike), before, after, most)
     return result
 
 
-def _find_by_drawn_bodies(alone: Mapping[int, DrawnSearch]) -> list[TurnedTrial]:
+def _find_by_drawn_bodies(alone: Mapping[int, DrawnSearch]) -> dict[int, Finding]:
     """Find the few trials, each searched alone, in which a drive opposes bodies and friction."""
     against = {k: search.drives_against_bodies() for k, search in alone.items()}
     often = Counter(name for names in against.values() for name in names)
-    found = []
+    found = {}
     for k, search in alone.items():
         if names := [name for name in against[k] if 2 * often[name] < len(alone)]:
             one = sign_correction(search.signals, names)
             before, after = search.judge(()), search.judge((one,))
-            if before and after and gain_of(before, after, 0.0) > LEAST_GAIN:
-                found.append(TurnedTrial(k, (one,), before, after))
+            gain = gain_of(before, after, 0.0) if before and after else 0.0
+            if before and after and gain > LEAST_GAIN:
+                found[k] = Finding(one, (), before, after, gain)
     return found

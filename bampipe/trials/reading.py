@@ -185,7 +185,7 @@ def read_samples(run: RunFolder, trial_id: str, system: System) -> dict[str, Arr
 def input_columns(
     columns: Mapping[str, Array], names: Sequence[str], brakes: Mapping[str, str]
 ) -> Array:
-    """Return inputs of a model by their ``names``, (T, n_u), from raw samples.
+    """Return inputs of a model by their ``names``, (T, n_u), from raw samples; gaps are bridged.
 
     ``columns`` are t, force_<c>, brake_<axis>, ...; a brake without a column was off. ``brakes``
     has the name of each axis' brake command. An input without a column raises `InputError`.
@@ -201,6 +201,9 @@ def input_columns(
             values[:, number] = columns[logged]
         elif name not in column:
             raise _no_column(name, "ingest/samples.parquet")
+    for row in values.T:
+        if (lost := np.isnan(row)).any():
+            row[lost] = np.interp(t[lost], t[~lost], row[~lost])
     return values
 
 

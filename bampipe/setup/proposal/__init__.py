@@ -20,6 +20,7 @@ from bampipe.files import write_text
 from bampipe.lists import join_names
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
+from bampipe.setup.drawn_bodies import STATED
 from bampipe.setup.mounting import Mounting
 from bampipe.setup.proposal.device import (
     DEVICE,
@@ -33,7 +34,7 @@ from bampipe.setup.proposal.device import (
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
-from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
+from bampipe.setup.proposal.robot import RobotColumns, find_robot_columns
 from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
 
 SESSION = "session.toml"
@@ -93,19 +94,20 @@ def propose(
     found, registers = signed_readings(fresh_readings(found, notes), notes)
     chosen = find_device(folder, found, device)
     clock = clock_of(found, notes)
-    match = Matcher(found, clock.t, set(clock.columns), registers)
+    match = Matcher(found, clock.t, set(clock.columns), registers, notes)
     if chosen is None:
-        chosen = new_device(folder, match, notes)
+        chosen = new_device(folder, match)
     elif (robot := chosen.device.robot) is not None:
         columns = find_robot_columns(folder, chosen.device, robot, found, clock.t, notes)
-        match.robot = columns
+        match.robot, match.given = columns, columns.columns
         chosen = _with_guessed_motors(folder, chosen, match)
         if columns.mounting is not None and columns.mounting.hangs:
             chosen = _hang(folder, chosen, columns.mounting, notes)
         chosen = _check_robot(chosen, robot, columns, notes)
-    encoders, axes = encoders_table(chosen.device, match, notes)
-    inputs = input_tables(chosen, axes, match, notes)
-    if len(match.rivals) > 1 and len(chosen.device.coordinates) == 1:
+    match.axes = len(chosen.device.coordinates)
+    encoders, axes = encoders_table(chosen.device, match)
+    inputs = input_tables(chosen.device, axes, match)
+    if len(match.rivals) > 1 and match.axes == 1:
         measured = join_names(column.name for column in axes.values())
         notes.check.append(
             f"of {join_names(match.rivals, 6)}, {measured} is the measured position; if these are a"
@@ -123,7 +125,7 @@ def propose(
         *encoders,
         *inputs,
         *([f"# not used: {', '.join(left)}", ""] if left else []),
-        *_trials_tables(chosen.device, axes, match, notes, UNKNOWN not in clock.rate),
+        *_trials_tables(chosen.device, axes, match, UNKNOWN not in clock.rate),
     ]
     return ProposedSession(
         session="\n".join(lines) + "\n",
@@ -189,10 +191,10 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> 
         reference = max(size, key=lambda name: size[name])
         scale_sd[reference] = f", scale_sd = {robot.uncertainty}"
         return with_motors(folder, chosen, guessed, reference.removeprefix("current_"))
-    if columns.gears and all(LEAST_AT_JOINT < size < 1.0 / LEAST_AT_JOINT for size in of_motor):
+    if columns.gears and all(STATED[0] < size < STATED[1] for size in of_motor):
         scale_sd |= dict.fromkeys(columns.drives, _GUESSED_GEAR)
         return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
-    if not columns.gears and all(size < LEAST_AT_JOINT for size in sizes):
+    if not columns.gears and all(size < STATED[0] for size in sizes):
         gears = {j: (1.0 / size, None) for j, size in zip(joints, sizes, strict=True)}
         scale_sd |= dict.fromkeys(columns.drives, f", scale_sd = {robot.uncertainty}")
         return with_motors(folder, chosen, gears)
@@ -241,7 +243,7 @@ def _check_robot(
 
 
 def _trials_tables(
-    device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes, timed: bool
+    device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, timed: bool
 ) -> list[str]:
     """Propose the trials and their kinds; a long single record is cut at rests of its axis.
 
@@ -254,12 +256,12 @@ def _trials_tables(
         cuts, where = guesses.stretches(match.t, next(iter(axes.values())).values), "at rests"
     lines = []
     if cuts:
-        note = notes.guess(f"one record, cut {where}, so that each part can be held out")
+        note = match.notes.guess(f"one record, cut {where}, so that each part can be held out")
         lines.append(note.strip())
     for trial in trials:
         for start_s, end_s in pairwise([None, *cuts, None]):
             lines += ["[[trials]]", f"file = {quoted(trial.file)}"]
-            lines += _trial_kind(trial.file, device, notes)
+            lines += _trial_kind(trial.file, device, match.notes)
             stretch = {"recording": trial.recording, "start_s": start_s, "end_s": end_s}
             lines += [f"{key} = {value}" for key, value in stretch.items() if value is not None]
             lines += [f"part = {quoted(trial.part)}"] if trial.part else []

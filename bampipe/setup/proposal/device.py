@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,6 @@ from bampipe.physics.device import KINDS, Device
 from bampipe.setup.hypotheses import MOST_TRAVEL
 from bampipe.setup.proposal.joints import chain_logged
 from bampipe.setup.proposal.matching import Matcher
-from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import (
     SLIDING,
     in_counts,
@@ -57,13 +56,11 @@ class ChosenDevice:
     Attributes:
         name: of a built-in device, or the path of a device file relative to the folder of logs.
         text: of a new device file, "" where there is one already.
-        columns: what the inputs of a new device were made from, by the name of the input.
     """
 
     name: str
     device: Device
     text: str = ""
-    columns: Mapping[str, SurveyedColumn] = field(default_factory=dict)
 
 
 def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None:
@@ -202,14 +199,14 @@ def _built_in(found: Survey) -> ChosenDevice | None:
     return None
 
 
-def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
+def new_device(folder: Path, match: Matcher) -> ChosenDevice:
     """Propose a device file for one axis, with priors by a rough fit to the first log.
 
     Raises:
         InputError: no column looks like a position.
     """
-    found = match.found
-    position = match.position("", 1, notes)
+    found, notes = match.found, match.notes
+    position = match.position("")
     if position is None:
         way = "say in order what they are: bampipe init FOLDER --names t,angle_deg,..."
         if not is_text(found.trials[0].file):
@@ -222,7 +219,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     linear = slides(position, found)
     driver, role = match.driver(position)
     supply = match.supply(driver) if role == "duty" else None
-    coil = role == "force" and _has_coil(driver, match, notes)
+    coil = role == "force" and _has_coil(driver, match)
     read, position = (position, position) if linear else _at_joint(position, driver, match)
     fit = _rough_fit(position, driver, role, linear, match.t)
     if driver is not None and fit.feeds:
@@ -243,8 +240,11 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     match.geared = position.name if springs and _may_be_geared(position) else ""
     weight, on_gravity = weight_of(position, fit, linear, found, bool(match.geared))
     name = position.name.removesuffix(f" [{read.stated}]")
-    starter = starter_device(name, linear, drive, fit, weight, width)
-    match.given = {starter.axis: read}
+    text = starter_device(name, linear, drive, fit, weight, width)
+    device = registry.device_from(tomllib.loads(text), DEVICE)
+    axis, placeholders = device.coordinates[0].name, list(device.constants)
+    known = {axis: read, "supply": supply, device.forces[0]: driver}
+    match.given = {name: column for name, column in known.items() if column is not None}
     if match.turning and role == "force" and driver is not None and "motor" in words(driver.name):
         notes.check.append(
             f"{driver.name} is the torque of a motor, by its name: for that of the joint put the"
@@ -256,25 +256,18 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         doubt = "" if set(words(position.name)) & SLIDING else _MAY_TURN.format(position.name)
     what = "torque" if role == "force" and not linear else role
     notes.check.append(
-        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {what}{doubt}; put in what you"
-        " know of it"
+        f"{DEVICE}: one {kind} axis '{axis}' driven by a {what}{doubt}; put in what you know of it"
     )
-    if starter.placeholders:
-        are, them = ("are", "them") if len(starter.placeholders) > 1 else ("is", "it")
-        said = f"{join_names(starter.placeholders)} {are} not yours yet"
+    if placeholders:
+        are, them = ("are", "them") if len(placeholders) > 1 else ("is", "it")
+        said = f"{join_names(placeholders)} {are} not yours yet"
         notes.check.append(f"{DEVICE}: {said}: all forces and inertias scale with {them}")
     if on_gravity:
-        notes.check.append(f"{DEVICE}: on '{starter.axis}', {on_gravity}")
-    columns = {"supply": supply, starter.input: driver}
-    return ChosenDevice(
-        DEVICE,
-        registry.device_from(tomllib.loads(starter.text), DEVICE),
-        starter.text,
-        {name: column for name, column in columns.items() if column is not None},
-    )
+        notes.check.append(f"{DEVICE}: on '{axis}', {on_gravity}")
+    return ChosenDevice(DEVICE, device, text)
 
 
-def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bool:
+def _has_coil(driver: SurveyedColumn | None, match: Matcher) -> bool:
     """Whether a current beside a force is that of a coil or a brake, rather than of the drive."""
     found = (c for c in match.found.of("current") if not c.is_constant)
     currents = [c for c in found if "motor" not in words(c.name)]
@@ -285,12 +278,12 @@ def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bo
     alike = [c for c, same in zip(currents, together, strict=True) if same]
     for current in alike:
         match.used.add(current.name)
-        notes.check.append(
+        match.notes.check.append(
             f"{current.name} goes with {driver.name}: both are of the drive, and {driver.name} is"
             " taken; either would do"
         )
     coils = [c.name for c in currents if c.name not in match.used]
-    notes.check += [
+    match.notes.check += [
         f"{name} is taken for the current in the coil of a brake or damper; it is a commanded"
         " value, since no measured current was found"
         for name in coils

@@ -4,9 +4,11 @@ Columns that belong together have names alike but for the joint: its name, or a 
 with a column for every joint count, so no joint gets what is left over from another.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit
@@ -30,6 +32,10 @@ class Group:
 
     columns: tuple[SurveyedColumn, ...]
     named: bool
+
+    def reordered(self, order: Sequence[int]) -> Group:
+        """The same columns as those of other joints: of each, the number of its column."""
+        return replace(self, columns=tuple(self.columns[k] for k in order))
 
     def __str__(self) -> str:
         return f"{self.columns[0].name} to {self.columns[-1].name}"

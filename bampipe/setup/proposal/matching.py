@@ -30,6 +30,7 @@ class Matcher:
         t: (T,) time stamps of the first log, s.
         used: names of the columns that have a meaning already; grows as tables are proposed.
         registers: columns that hold signed numbers in a register, and how.
+        notes: what a person has to look at; axes: number of those of the device.
         robot: columns of a robot of which the drawing tells, and how they are counted.
         turning: what the readings of a position are worth, by the weight on it, by name of column.
         given: columns that are known, by name of axis or input.
@@ -43,6 +44,8 @@ class Matcher:
     t: np.ndarray
     used: set[str]
     registers: Mapping[str, Register]
+    notes: Notes
+    axes: int = 1
     robot: RobotColumns = field(default_factory=RobotColumns)
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
     given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
@@ -53,9 +56,8 @@ class Matcher:
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
-        known = {**self.robot.columns, **self.given}
-        if name in known:
-            return known[name]
+        if name in self.given:
+            return self.given[name]
         wanted, numbers = set(words(name)), set(_numbers(name))
         for column in self.found.of(*roles):
             counted = set(_numbers(column.name))
@@ -64,13 +66,10 @@ class Matcher:
                 return column
         return None
 
-    def position(self, axis: str, axes: int, notes: Notes) -> SurveyedColumn | None:
-        """The measured position of an axis, "" for any; a guess is noted if it is one of several.
-
-        Of several ``axes``, only the name tells which is which.
-        """
+    def position(self, axis: str) -> SurveyedColumn | None:
+        """The measured position of an axis, "" for any; of several axes, only the name tells."""
         named = self.named(axis, "position") if axis else None
-        if named is not None or axes > 1:
+        if named is not None or self.axes > 1:
             return named
         moving = [c for c in self.found.columns if not c.is_constant]
         found = [c for c in moving if c.role == "position"]
@@ -117,8 +116,8 @@ class Matcher:
 
     def _input(self, name: str, si: str, axes: tuple[SurveyedColumn, ...]) -> Match:
         role = _INPUT_ROLE.get(si, "")
-        if name in self.robot.columns:
-            return self.robot.columns[name], ""
+        if name in self.given:
+            return self.given[name], ""
         free = [c for c in self.found.columns if c.name not in self.used]
         exact = next((c for c in free if c.name == name), None)
         named = exact or self.named(name, role) or self.named(name.removeprefix("force_"), role)

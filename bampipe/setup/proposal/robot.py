@@ -15,6 +15,7 @@ from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
 from bampipe.setup.drawn_bodies import (
+    STATED,
     Comparison,
     Drive,
     JointMotion,
@@ -30,9 +31,9 @@ from bampipe.setup.proposal.positions import in_counts, position_in_si, scale_to
 
 BEYOND = 1.5
 """Times its range that a joint must travel for the position to be another's."""
-DOUBTED = 0.01
+_DOUBTED = 0.01
 """Of the drives' variance: what other units and zeros are tried from."""
-MOST_ROWS, FEW_ROWS = 4000, 1000
+_MOST_ROWS, _FEW_ROWS = 4000, 1000
 _SMOOTHED_S = 0.1
 """Stretch of a record over which a parabola gives velocity and acceleration."""
 _MARGINS = (1.05, 1.4, 2.0)
@@ -43,8 +44,6 @@ _SURE_LEFT = 0.02
 """Of the drives' variance: what the right reductions leave at most where zeros are guessed, too."""
 _ALTERNATIONS = 2
 """How often zeros are sought with the reductions found so far, and reductions with these zeros."""
-LEAST_AT_JOINT = 1.0 / 3.0
-"""Share of what the drawing requires below which a torque is that of a motor."""
 _BETTER = 0.5
 """Of what one order of the joints leaves unexplained: another one must leave less."""
 PUT_IN = (
@@ -56,11 +55,15 @@ _OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}
 
 @dataclass(frozen=True)
 class Gears:
-    """Turns of motors for one of each joint, (n,), and what these and a mounting make of drives."""
+    """Turns of motors for one of each joint, (n,), and what these and a mounting make of drives.
+
+    ``compared``: the drives beside the drawing.
+    """
 
     ratio: Array
     mounting: Mounting
     drives: list[Drive]
+    compared: Comparison
 
 
 @dataclass(frozen=True)
@@ -82,56 +85,65 @@ class Logged:
         columns = zip(self.device.coordinates, group.columns, strict=True)
         return np.column_stack([position_in_si(column, self.t, c.unit) for c, column in columns])
 
-    def compare(self, q: Array, drives: Group, ratio: Array, most_rows: int) -> Comparison | None:
-        """The drives beside the drawing along positions (T, n); None where these do not do."""
-        step = float(np.median(np.diff(self.t)))
+    def compare(
+        self, positions: Group, drives: Group, ratio: Array, turned: Array | float = 1.0
+    ) -> tuple[Comparison, Comparison] | None:
+        """The drives beside the drawing, at few samples and at many; None where these do not do.
+
+        ``turned``: of what the encoders sit on, turns for one of its joint, (n,).
+        """
+        q, step = self.positions(positions) / turned, float(np.median(np.diff(self.t)))
         window = max(5, 2 * round(0.5 * _SMOOTHED_S / step) + 1) if step > 0.0 else len(q)
         if not np.isfinite(q).all() or window >= len(q):
             return None
-        rows, unit = slice(None, None, max(1, len(q) // most_rows)), self.device.force_unit
-        motion = JointMotion(
-            *(savgol_filter(q, window, 2, deriv=k, delta=step, axis=0)[rows] for k in range(3))
-        )
-        forces = [scale_to(unit, c) * np.nan_to_num(c.values)[rows] for c in drives.columns]
+        smooth = (savgol_filter(q, window, 2, deriv=k, delta=step, axis=0) for k in range(3))
+        motion, unit = JointMotion(*smooth), self.device.force_unit
+        forces = [scale_to(unit, c) * np.nan_to_num(c.values) for c in drives.columns]
+        drive = np.column_stack(forces)
         turning = tuple(c.unit == "rad" for c in self.device.coordinates)
-        return Comparison(self.robot, turning, [motion], np.column_stack(forces), ratio)
 
-    def explain(self, q: Array, drives: Group, ratio: Array) -> Gears | None:
+        def at(most_rows: int) -> Comparison:
+            rows = slice(None, None, max(1, len(q) // most_rows))
+            return Comparison(self.robot, turning, [motion.rows(rows)], drive[rows], ratio)
+
+        return at(_FEW_ROWS), at(_MOST_ROWS)
+
+    def explain(
+        self, positions: Group, drives: Group, ratio: Array, turned: Array | float = 1.0
+    ) -> Gears | None:
         """How the drawing explains the drives, best mounted; None where they do not compare."""
-        few, many = (self.compare(q, drives, ratio, rows) for rows in (FEW_ROWS, MOST_ROWS))
-        if few is None or many is None:
+        compared = self.compare(positions, drives, ratio, turned)
+        if compared is None:
             return None
-        mounting, judged = many.nominal, many.hold(many.nominal)
-        if max(drive.left for drive in judged) >= DOUBTED:
-            mounting = find_mounting(few.turning, few.nominal, few.misfit)
-            judged = many.hold(mounting) if mounting.changes else judged
-        return Gears(ratio, mounting, judged)
+        few, many = compared
+        mounting = many.best_mounting(few, _DOUBTED)
+        return Gears(ratio, mounting, many.hold(mounting), many)
 
-    def explain_geared(self, q: Array, drives: Group, turns: Array) -> Gears | None:
+    def explain_geared(self, positions: Group, drives: Group, turns: Array) -> Gears | None:
         """Positions of motors whose ``turns`` for one of the joint, (n,), are known.
 
         None where they leave a joint beyond its range, or the log is incomplete.
         """
-        if (np.ptp(q / turns, axis=0) > BEYOND * self.ranges).any():
+        if (np.ptp(self.positions(positions) / turns, axis=0) > BEYOND * self.ranges).any():
             return None
-        found = self.explain(q / turns, drives, turns)
+        found = self.explain(positions, drives, turns, turns)
         if found is None:
             return None
         turned = replace(found.mounting, direction=found.mounting.direction * np.sign(turns))
-        return Gears(np.abs(turns), turned, found.drives)
+        return replace(found, ratio=np.abs(turns), mounting=turned)
 
-    def find_gears(self, q: Array, drives: Group) -> Gears | None:
+    def find_gears(self, positions: Group, drives: Group) -> Gears | None:
         """Turns of each motor for one of its joint, by positions on the side of the motors.
 
         Weight goes with the sine of the joint's angle, so only the right reductions and zeros let
         the drawing explain the drives. None where none do well.
         """
-        least = np.ptp(q, axis=0) / self.ranges
+        least = np.ptp(self.positions(positions), axis=0) / self.ranges
         moved, at_joint = least > BEYOND, np.ones(len(least))
-        few, many = (self.compare(q, drives, at_joint, rows) for rows in (FEW_ROWS, MOST_ROWS))
-        if not moved.any() or few is None or many is None:
+        compared = self.compare(positions, drives, at_joint) if moved.any() else None
+        if compared is None:
             return None
-        base, in_torque = few, self.device.force_unit == "N.m"
+        (few, many), in_torque = compared, self.device.force_unit == "N.m"
 
         def fitted(ratio: Array, mounting: Mounting) -> tuple[float, Array]:
             """Cost and reductions of the fit that starts at ``ratio``."""
@@ -139,7 +151,7 @@ class Logged:
             def misfit(x: Array) -> Array:
                 tried = at_joint.copy()
                 tried[moved] = np.exp(x)
-                judged = base.reread(np.diag(1.0 / tried)).hold(mounting)
+                judged = few.reread(np.diag(1.0 / tried)).hold(mounting)
                 left = np.sqrt([max(drive.left, 1e-12) for drive in judged])
                 if not in_torque:
                     return np.asarray(left)
@@ -154,9 +166,10 @@ class Logged:
             return float(found.cost), best
 
         def sound(ratio: Array, mounting: Mounting) -> Gears | None:
-            judged = many.reread(np.diag(1.0 / ratio)).hold(mounting)
+            geared = many.reread(np.diag(1.0 / ratio))
+            found = Gears(ratio, mounting, geared.hold(mounting), geared)
             # A gear that speeds up would take the joint further beyond its range than the log goes.
-            return Gears(ratio, mounting, judged) if fits(judged) and ratio.min() >= 1.0 else None
+            return found if fits(found.drives) and ratio.min() >= 1.0 else None
 
         starts = [np.where(moved, factor * least, 1.0) for factor in _MARGINS]
         ratio = min((fitted(start, few.nominal) for start in starts), key=lambda one: one[0])[1]
@@ -226,38 +239,31 @@ def find_robot_columns(
 
     if positions is None or drives is None or any(map(in_counts, positions.columns)):
         return RobotColumns(joints, pair(positions, drives) | some_drives)
-
-    def explain(positions: Group, drives: Group) -> Gears | None:
-        """How the drawing explains the drives; None where they cannot be compared."""
-        if turns is None:
-            return None
-        return logged.explain(logged.positions(positions), drives, turns)
-
-    stated = positions
-    best = explain(positions, drives)
+    best = logged.explain(positions, drives, turns) if turns is not None else None
+    if turns is None or best is None:
+        notes.check += _beyond_range(logged, positions, of_joint=False)
+        return RobotColumns(joints, pair(positions, drives))
+    stated, known = positions, bool((turns != 1.0).any())
     other_unit = _in_unit_of_range(logged, positions)
-    other = explain(other_unit, drives) if other_unit is not None else None
-    if other_unit is not None and other is not None and mean_left(other.drives) < _BETTER:
+    other = logged.explain(other_unit, drives, turns) if other_unit else None
+    if other_unit and other and mean_left(other.drives) < _BETTER:
         positions, best = other_unit, other
         notes.check.append(
             "positions state no unit and go beyond the joints' ranges: degrees are taken; if they"
             f" are radians of motors, {PUT_IN}"
         )
-    left = mean_left(best.drives) if best is not None else np.inf
-    sound = best is not None and fits(best.drives)
+    left, sound = mean_left(best.drives), fits(best.drives)
     beyond = _beyond_range(logged, positions, of_joint=sound)
-    guessed = positions is not stated and DOUBTED < left < np.inf
-    known = turns is not None and (turns != 1.0).any()
+    guessed = positions is not stated and left > _DOUBTED
+    on_motors = bool(beyond) if known else guessed and not robot.motors
     geared: list[tuple[Group, Gears]] = []
     # Hundreds without a unit are degrees, or radians of a motor.
     pairs = zip(device.coordinates, stated.columns, strict=True)
     in_si = replace(stated, columns=tuple(replace(p, unit=p.unit or c.unit) for c, p in pairs))
-    for group in (positions, in_si):
-        gears = None
-        if turns is not None and known and (beyond or not sound):
-            gears = logged.explain_geared(logged.positions(group), drives, turns)
-        elif best is not None and not robot.motors and (guessed or not sound):
-            gears = logged.find_gears(logged.positions(group), drives)
+    for group in (positions, in_si) if on_motors or not sound else ():
+        gears = logged.explain_geared(group, drives, turns) if known else None
+        if not robot.motors:
+            gears = logged.find_gears(group, drives)
         geared += [(group, gears)] if gears is not None else []
     if geared:
         group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
@@ -265,16 +271,13 @@ def find_robot_columns(
         if better or (bool(beyond) if known else not sound):
             return _geared(device, pair(group, drives), gears, notes, given=known)
     notes.check += beyond
-    if best is None or (beyond and not sound):
+    if beyond and not sound:
         return RobotColumns(joints, pair(positions, drives))
     if not (positions.named or drives.named or sound):
         # ROS publishes joints so: the first column is the first name of the alphabet.
         order = [sorted(joints).index(name) for name in joints]
-        ordered = [
-            replace(group, columns=tuple(group.columns[k] for k in order))
-            for group in (positions, drives)
-        ]
-        other = explain(*ordered)
+        ordered = positions.reordered(order), drives.reordered(order)
+        other = logged.explain(*ordered, turns)
         if other is not None and mean_left(other.drives) < _BETTER * left:
             notes.check.append(
                 "columns stand in the alphabetical order of the joints' names, since weight and"
@@ -282,11 +285,9 @@ def find_robot_columns(
                 f" way, {max(1.0 - left, 0.0):.1%} in the order of the chain"
             )
             best, (positions, drives) = other, ordered
-    compared = logged.compare(logged.positions(positions), drives, best.ratio, MOST_ROWS)
-    if compared is not None and device.force_unit != "A":
-        heavy = find_heavy(compared, best.mounting)
+    if device.force_unit != "A" and (heavy := find_heavy(best.compared, best.mounting)):
         in_tip = _placed_in_tip(folder, robot)
-        notes.check += [describe_heavy(compared, best.mounting, heavy, in_tip)] if heavy else []
+        notes.check.append(describe_heavy(best.compared, best.mounting, heavy, in_tip))
     columns = pair(positions, drives)
     by_input = dict(zip(device.forces, best.drives, strict=True))
     notes.check += _sentences(device, columns, by_input)
@@ -401,9 +402,9 @@ def _sentences(
             said.append(f"its sign is turned; or that of {c.name} is the wrong one")
         if device.force_unit == "A":
             agreed.append(f"{c.name} {1.0 / size:.3g} N.m/A")
-        elif size >= 1.0 / LEAST_AT_JOINT:
+        elif size >= STATED[1]:
             said.append("another unit, or bodies that are not drawn")
-        elif size <= LEAST_AT_JOINT:
+        elif size <= STATED[0]:
             said.append(
                 f"another unit, or the torque of a motor with a reduction of about {1.0 / size:.3g}"
             )

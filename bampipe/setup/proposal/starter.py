@@ -84,16 +84,6 @@ class Drive:
     scaled: bool = True
 
 
-@dataclass(frozen=True)
-class Starter:
-    """A device file, its axis and its input, and the constants that only its user knows."""
-
-    text: str
-    axis: str
-    input: str
-    placeholders: tuple[str, ...]
-
-
 def weight_of(
     position: SurveyedColumn, fit: Driven, linear: bool, found: Survey, geared: bool
 ) -> tuple[Weight | None, str]:
@@ -140,8 +130,10 @@ def starter_device(
     found: Driven,
     weight: Weight | None = None,
     sign_width: float = 0.0,
-) -> Starter:
+) -> str:
     """Write a device file of one axis, which the column of its position may name.
+
+    Its constants are those that only its user knows.
 
     Args:
         found: sizes by a rough fit, SI, from which the priors are taken.
@@ -216,7 +208,7 @@ coulomb = {{ unit = "{torque}", {coulomb}, lower = 0.0 }}  # guess
         ):
             meaning = "what the coil adds, in proportion to its current"
             text += _parameter(name, f"{si}/A", _prior(size, wide), meaning, "lower = 0.0\n")
-    return Starter(text, axis, source, tuple(constants))
+    return text
 
 
 def _input_of(

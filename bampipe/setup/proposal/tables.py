@@ -14,7 +14,6 @@ from bampipe.data.units import bare, spelled, unit
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
-from bampipe.setup.proposal.device import ChosenDevice
 from bampipe.setup.proposal.matching import Match, Matcher
 from bampipe.setup.proposal.notes import UNITS, UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
@@ -201,50 +200,45 @@ def _increases(values: np.ndarray) -> bool:
     return len(known) > 3 and float(np.mean(np.diff(known) > 0)) > 0.9
 
 
-def encoders_table(
-    device: Device, match: Matcher, notes: Notes
-) -> tuple[list[str], dict[str, SurveyedColumn]]:
+def encoders_table(device: Device, match: Matcher) -> tuple[list[str], dict[str, SurveyedColumn]]:
     """Propose the column of every axis; its lines, and the columns found, by axis."""
     lines = ["[encoders]"]
     axes: dict[str, SurveyedColumn] = {}
     for axis in device.coordinates:
-        column = match.position(axis.name, len(device.coordinates), notes)
+        column = match.position(axis.name)
         if column is None:
-            note = notes.ask_column(f"the position of {axis.name}", axis.unit)
+            note = match.notes.ask_column(f"the position of {axis.name}", axis.unit)
             lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
             continue
         axes[axis.name] = column
         match.used.add(column.name)
-        alone = len(device.coordinates) == 1
-        table = _encoder(axis, alone, column, match, notes)
+        table = _encoder(axis, column, match)
         if register := match.registers.get(column.name):
             table = table.replace(" }", f"{register.fields} }}", 1)
-            notes.check.append(f"{column.name} is {register.words}")
+            match.notes.check.append(f"{column.name} is {register.words}")
         lines.append(f"{axis.name} = {table}")
     return [*lines, ""], axes
 
 
-def _encoder(
-    axis: Coordinate, alone: bool, column: SurveyedColumn, match: Matcher, notes: Notes
-) -> str:
+def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
     if is_velocity(column):
-        return _integrated(axis, column, notes)
+        return _integrated(axis, column, match.notes)
     if in_counts(column):
-        return _counted(axis, column, match, notes)
+        return _counted(axis, column, match)
     worth = match.turning.get(column.name)
     if worth is not None and column.si is not None:
         turns, sd = (column.scale * part for part in (worth.size, worth.sd))
         said = spelled(column.unit, _POSITION_UNITS)
         fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
         fields += f", scale_sd = {_rounded(sd / turns)}"
-        return entry(column.name, said, fields) + notes.guess(
+        return entry(column.name, said, fields) + match.notes.guess(
             f"{column.name} is the position of the motor of {axis.name}, which turns {turns:.4g} ±"
             f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
             " the angle; put in the ratio of the gear"
         )
     if column.name == match.geared:
         said = spelled(column.unit, _POSITION_UNITS)
-        return entry(column.name, said, ", gear_ratio = 0.0") + notes.ask(
+        return entry(column.name, said, ", gear_ratio = 0.0") + match.notes.ask(
             f"gear_ratio of {axis.name}, turns of {column.name} for one of it, 1 without a gear",
             "the gear's data sheet; the torque goes with the angle as weight behind a gear does",
         )
@@ -252,12 +246,12 @@ def _encoder(
     if (column.by_looks or column.is_foreign) and not right:
         looks = f"which looks like the position of {axis.name}"
         said = f"stated as '{column.stated}'" if column.is_foreign else looks
-        note = notes.ask("the unit of {}", UNITS, f"{column.name}, {said}")
-        return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
+        note = match.notes.ask("the unit of {}", UNITS, f"{column.name}, {said}")
+        return entry(column.name, UNKNOWN, _velocity_beside(axis, match)) + note
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
     said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
     fields, how = _counting(axis, said, match, match.robot.gears.get(axis.name, 1.0))
-    fields += "" if geared else _velocity_beside(axis, alone, match, notes)
+    fields += "" if geared else _velocity_beside(axis, match)
     guess = f"is the position of {axis.name}, in {said}" + (", by its size" if by_size else "")
     if geared:
         guess = f"is the position of the motor of {axis.name}, in {said}"
@@ -265,7 +259,7 @@ def _encoder(
         guess = "" if column.stated or how else f"is in {bare(column.unit)}"
     guess += ("; it " if guess and how else "") + how
     return entry(column.name, said, fields) + (
-        notes.guess(f"{column.name} {guess}") if guess else ""
+        match.notes.guess(f"{column.name} {guess}") if guess else ""
     )
 
 
@@ -301,7 +295,7 @@ def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
     return entry(column.name, said) + notes.guess(f"no position was recorded: {integral}")
 
 
-def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: Notes) -> str:
+def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
     """The entry of an encoder that counts; the weight of a joint may show what a count is worth."""
 
     def count(size: str, zero: float, scale_sd: str = "") -> str:
@@ -316,12 +310,12 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
         size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}"
         scale_sd = "" if is_power else f", scale_sd = {_rounded(sd / turn)}"
         taken = f" ({power:.0f}, a power of two, is taken)" if is_power else ""
-        return count(size, worth.zero, scale_sd) + notes.guess(
+        return count(size, worth.zero, scale_sd) + match.notes.guess(
             f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}{taken}, and"
             f" {worth.zero:.0f} where it hangs, by its weight, which goes with the sine of the"
             " angle; put in the encoder's counts a turn, times the gear, by 2 pi"
         )
-    return count("0.0", float(np.median(column.values))) + notes.ask(
+    return count("0.0", float(np.median(column.values))) + match.notes.ask(
         f"counts_per_unit of {{}}, the counts in one {axis.unit}; zero_counts is a guess"
         + (" of what is read where the drawing has 0" if match.robot.joints else ""),
         "counts a turn in the encoder's data sheet, times the gear, by 2 pi"
@@ -335,26 +329,22 @@ def _rounded(sd: float) -> str:
     return f"{float(f'{sd:.1g}'):g}"
 
 
-def _velocity_beside(axis: Coordinate, alone: bool, match: Matcher, notes: Notes) -> str:
+def _velocity_beside(axis: Coordinate, match: Matcher) -> str:
     """The field of a recorded velocity, against which the position is checked; "" without one."""
     for column in match.found.of("velocity"):
         fits = column.si == f"{axis.unit}/s" and not column.is_constant
-        if fits and (alone or axis.name in words(column.name)):
+        if fits and (match.axes == 1 or axis.name in words(column.name)):
             match.used.add(column.name)
-            notes.check.append(f"{column.name} is used to check the position only")
+            match.notes.check.append(f"{column.name} is used to check the position only")
             return f", velocity = {entry(column.name, bare(column.unit))}"
     return ""
 
 
-def input_tables(
-    chosen: ChosenDevice, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
-) -> list[str]:
+def input_tables(device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher) -> list[str]:
     """Propose the column of every input; the lines of those tables that have something to say."""
-    device = chosen.device
     wanted = {**dict.fromkeys(device.forces, device.force_unit), **device.channels}
     given = match.inputs(wanted, tuple(axes.values()))
-    given |= {name: (c, "") for name, c in chosen.columns.items() if name in wanted}
-    lines = []
+    lines, notes = list[str](), match.notes
     sensed = all(name.startswith("force_") for name in device.forces)
     forces = [column for name in device.forces if (column := given[name][0]) is not None]
     if sensed and len(forces) in (0, len(device.forces)):
@@ -363,7 +353,7 @@ def input_tables(
         ask = "" if forces else notes.ask_column(" and ".join(device.forces), device.force_unit)
         unit_of = [f'unit = "{device.force_unit}"']
         if forces:
-            unit_of = _force_unit(device, forces, given[device.forces[0]][1], notes)
+            unit_of = _force_unit(device, forces, given[device.forces[0]][1], match.notes)
         lines += [
             "[force]",
             f"columns = [{', '.join(map(quoted, names))}]{ask}",
@@ -374,8 +364,8 @@ def input_tables(
         if match.reacting in {column.name for column in forces}:
             lines.insert(-1, "reaction = true" + notes.guess(f"{match.reacting} is the reaction"))
         wanted = dict(device.channels)
-    lines += _brakes_table(device, match, notes)
-    return lines + _channels_table(wanted, given, match, notes)
+    lines += _brakes_table(device, match)
+    return lines + _channels_table(wanted, given, match)
 
 
 def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: Notes) -> list[str]:
@@ -448,7 +438,7 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
     return [f'unit = "{device.force_unit}"{note}']
 
 
-def _brakes_table(device: Device, match: Matcher, notes: Notes) -> list[str]:
+def _brakes_table(device: Device, match: Matcher) -> list[str]:
     brakes = {axis: c for axis, n in device.brakes.items() if (c := match.named(n, "brake"))}
     if not brakes:
         return []
@@ -457,13 +447,13 @@ def _brakes_table(device: Device, match: Matcher, notes: Notes) -> list[str]:
     return [
         "[brakes]",
         f"columns = [{', '.join(quoted(column.name) for column in brakes.values())}]",
-        f'unit = "{units}"' + notes.guess("brake commands are in SI units"),
+        f'unit = "{units}"' + match.notes.guess("brake commands are in SI units"),
         "",
     ]
 
 
 def _channels_table(
-    wanted: Mapping[str, str], given: Mapping[str, Match], match: Matcher, notes: Notes
+    wanted: Mapping[str, str], given: Mapping[str, Match], match: Matcher
 ) -> list[str]:
     """Lines for the inputs ``wanted``, by name, with their SI units; none if nothing is."""
     if not wanted:
@@ -472,18 +462,16 @@ def _channels_table(
     for name, si in wanted.items():
         column, why = given[name]
         if column is None:
-            lines.append(f"{name} = {entry(UNKNOWN, si)}{notes.ask_column(name, si)}")
+            lines.append(f"{name} = {entry(UNKNOWN, si)}{match.notes.ask_column(name, si)}")
             continue
         match.used.add(column.name)
-        lines.append(f"{name} = {_channel(name, si, column, why, match, notes)}")
+        lines.append(f"{name} = {_channel(name, si, column, why, match)}")
     return [*lines, ""]
 
 
-def _channel(
-    name: str, si: str, column: SurveyedColumn, why: str, match: Matcher, notes: Notes
-) -> str:
+def _channel(name: str, si: str, column: SurveyedColumn, why: str, match: Matcher) -> str:
     """Column and unit of one input; its register or its scale, where the unit does not do."""
-    register = match.registers.get(column.name)
+    register, notes = match.registers.get(column.name), match.notes
     fields = register.fields if register else ""
     turned = name in match.robot.turned or column.name == match.reacting
     fields += (", scale = -1.0" if turned else "") + match.scale_sd.get(name, "")
