@@ -90,8 +90,10 @@ def spread_stamps(t: Array) -> tuple[Array, float]:
     if np.any(np.abs(steps / rounding - np.rint(steps / rounding)) > 0.1):
         return t, 0.0
     rows, first = np.arange(len(t), dtype=np.float64), np.flatnonzero(steps > 0.0) + 1
+    if len(first) < 2:
+        return t, 0.0
     # All rows of a stamp would tilt the line by where the first and the last stamp are cut.
-    slope, start = np.polyfit(rows[first], t[first] - t[0], 1) if len(first) > 2 else (step, 0.0)
+    slope, start = np.polyfit(rows[first], t[first] - t[0], 1)
     if np.ptp(t - t[0] - slope * rows) <= 1.2 * rounding:
         return t[0] + start + slope * rows, rounding
     if len(first) < 3 or len(t) < 2 * len(first):
