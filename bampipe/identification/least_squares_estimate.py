@@ -155,7 +155,7 @@ class SquaresFit:
             seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), _PERIODS / min(band.cutoff_hz)
         )
         samples = lay_out_samples(self.fit.linearisation, min(self.block_s, most))
-        tailed = [_TAILED if np.ptp(root) > 0.0 else 1.0 for root in self.fit.likelihood.root]
+        tailed = [_TAILED if np.any(root != root[:1]) else 1.0 for root in self.fit.likelihood.root]
         rows = ((x, left / by) for (x, left), by in zip(self.rows, tailed, strict=True))
         independent = [s.independent * by**2 for s, by in zip(samples, tailed, strict=True)]
         found = covariance_by_blocks(rows, pose.precision, [s.block for s in samples], independent)

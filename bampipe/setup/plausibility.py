@@ -101,7 +101,9 @@ def judge_setup(
             on_trials = (ModelOnTrial(system, linearisation.p, [motion]) for motion in motions)
             applied = [band.thin(on_trial.applied) for on_trial in on_trials]
             size, used = rms(applied, linearisation.used), np.concatenate(linearisation.used)
-            varied = np.std(np.concatenate(applied), axis=0, where=used)
+            sums = np.sum(np.concatenate(applied), axis=0, where=used)
+            middle = sums / np.maximum(used.sum(axis=0), 1)
+            varied = rms([force - middle for force in applied], linearisation.used)
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
         moving = np.mean(used, axis=0)
