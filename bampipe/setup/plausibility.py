@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -40,9 +41,9 @@ class Plausibility:
     """Result of a least-squares fit of the bare device under one set-up.
 
     Attributes:
-        error: of the fit by axis, relative to the applied force, (n_q,); 1 if the axis hardly
-            moves, 0 if nothing is applied. Mistakes are so gross that the fit shows them; held-out
-            trials would be extrapolated from a few slow ones that determine little.
+        error: of the fit by axis, relative to the applied force, or to that of inertia if nothing
+            is applied, (n_q,); 1 if the axis hardly moves. Mistakes are so gross that the fit shows
+            them; held-out trials would be extrapolated from a few slow ones that determine little.
         moving: fraction of the samples in which each axis moves, (n_q,).
         p: parameters, (n_p,).
         objections: half the squared distance of each parameter from its prior, in prior
@@ -104,6 +105,10 @@ def judge_setup(
             sums = np.sum(np.concatenate(applied), axis=0, where=used)
             middle = sums / np.maximum(used.sum(axis=0), 1)
             varied = rms([force - middle for force in applied], linearisation.used)
+            if not size.all():
+                mass = [system.mass_matrix(m.q, linearisation.p) for m in motions]
+                inertial = map(np.einsum, repeat("tij,tj->ti"), mass, [m.qdd for m in motions])
+                size = np.where(size > 0.0, size, rms(map(band.thin, inertial), linearisation.used))
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
         moving = np.mean(used, axis=0)

@@ -12,7 +12,7 @@ from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
 from bampipe.setup.drawn_bodies import Comparison, JointMotion
 from bampipe.setup.hypotheses import scale_correction
-from bampipe.setup.plausibility import Plausibility
+from bampipe.setup.plausibility import Plausibility, judge_setup
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch
 from bampipe.setup.search import Finding, shorten
 from bampipe.setup.turned_trials import find_turned_trials
@@ -158,6 +158,12 @@ def turned(factor: float, zero: float, joint: int, drive: float) -> list[Motion]
         channels = {**motion.channels, name: drive * motion.channels[name]}
         found.append(replace(counted(motion, factor**at, zero * at), channels=channels))
     return found
+
+
+def test_a_drive_that_reads_nothing_explains_no_motion() -> None:
+    search = search_in(turned(1.0, 0.0, 1, 0.0))
+    held = judge_setup(search.system, search.motions, search.band, search.folds, 4)
+    assert held is not None and (held.left > 0.5).tolist() == [False, True, False, False]
 
 
 @pytest.mark.parametrize(
