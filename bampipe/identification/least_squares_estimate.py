@@ -202,14 +202,13 @@ class SquaresFit:
 
         In a single trial, a period of the band on either side is left out as well.
         """
-        band, groups = self.trials.band, self.trials.folds.groups
+        band, groups = self.trials.band, np.array(self.trials.folds.groups)
         if len(self.parts) == 1:
             return [np.zeros(self.free.size)]
         if len(groups) > 1:
-            others = {group: np.array(groups) != group for group in groups}
             found = {
-                group: self._move_to([s[kept].sum(axis=0) for s in self.by_trial])
-                for group, kept in others.items()
+                each: self._move_to([s[groups != each].sum(axis=0) for s in self.by_trial])
+                for each in np.unique(groups)
             }
             return [found[group] for group in groups]
         t, *blocks = (m.t[band.thinned_rows(len(m.t))] for m in (*self.trials.motions, *self.parts))

@@ -203,7 +203,7 @@ class Comparison:
         found = []
         for k, way in enumerate(np.sign(self.ratio)):
             turns = [way * np.eye(len(self.ratio))[k], *(t for t in self.shared if t[k])]
-            columns, powers = [], np.zeros(3 * len(turns))
+            columns, m = [], len(turns)
             widest = [
                 _TURNING * max(np.abs(motion.rate @ by).max() for motion in self.motions)
                 for by in turns
@@ -212,10 +212,9 @@ class Comparison:
                 changes, rates = ([x @ by for by in turns] for x in (motion.change, motion.rate))
                 signs = [np.tanh(r / max(w, 1e-9)) for r, w in zip(rates, widest, strict=True)]
                 columns.append(np.column_stack([*changes, *rates, *signs]))
-            thinned, m = self._thinned(columns, k), len(turns)
-            rate, sign = thinned[:, m : 2 * m], thinned[:, 2 * m :]
-            powers[m : 2 * m] = np.mean(rate**2, axis=0) if len(rate) else 0.0
-            powers[2 * m :] = np.mean(sign * rate, axis=0) if len(rate) else 0.0
+            thinned = self._thinned(columns, k)
+            rate, both = thinned[:, m : 2 * m], thinned[:, m:]
+            powers = np.append(np.zeros(m), np.sum(both * np.tile(rate, 2), 0) / max(len(rate), 1))
             found.append(
                 Losses.of(thinned, powers, self._rows(self.drives[:, k], k), self.has_offset)
             )
@@ -304,22 +303,20 @@ class Losses:
         square, whole = (float(by_part @ of @ by_part) for of in sums[:2])
         along, power = (float(of @ by_part) for of in sums[2:])
         left, count = float(self.drive @ self.drive), max(len(self.drive), 1)
-        if not self.known:
-            return Drive(0.0, np.inf, left / count / self.size, 0.0)
         # Losses alone may explain all that is required, as the mass of a slide by its drive's.
-        inverse = 1.0 / square if square > 1e-18 * max(whole, 1e-300) else 0.0
+        inverse = self.known / square if square > 1e-18 * max(whole, 1e-300) else 0.0
         share = along * inverse
         mean_square = max(left - share * along, 0.0) / count
         # Errors of neighbouring samples are correlated: about one sample in ten is independent.
         variance = 10.0 * mean_square
         power_sd = np.sqrt(variance * (float(self.power @ self.power) + power**2 * inverse))
         taken = direction * (self.taken - share * power)
-        held = min(max(share, bounds[0]), bounds[1])
+        held = min(max(share, bounds[0]), bounds[1]) if inverse else 0.0
         return Drive(
             share,
             float(np.sqrt(variance * inverse)) if inverse else np.inf,
             (mean_square + (held - share) ** 2 * square / count) / self.size,
-            float(taken / max(power_sd, 1e-300)),
+            float(self.known * taken / max(power_sd, 1e-300)),
         )
 
 
@@ -442,12 +439,7 @@ def describe_heavy(
 
 def with_heavier_body(robot: Robot, found: HeavierBody) -> Robot:
     """The robot with the mass and inertia of a body multiplied by the factor found."""
-    joints = list(robot.joints)
-    one = joints[found.place]
-    joints[found.place] = one.model_copy(
-        update={
-            "mass": found.factor * one.mass,
-            "inertia": tuple(found.factor * number for number in one.inertia),
-        }
-    )
+    joints, one = list(robot.joints), robot.joints[found.place]
+    more = {"mass": found.factor * one.mass, "inertia": tuple(found.factor * np.array(one.inertia))}
+    joints[found.place] = one.model_copy(update=more)
     return robot.model_copy(update={"joints": tuple(joints)})

@@ -18,7 +18,7 @@ from bampipe.physics.parameter import Parameter
 from bampipe.trials.folds import Folds
 from bampipe.trials.linearisation import Linearisation, linearise_fit
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import ModelOnTrial, rms
+from bampipe.trials.residuals import rms
 
 WEIGHT = 8.0
 """Weight of the logarithm of an axis' error: a third of the error counts as much as a parameter
@@ -99,12 +99,11 @@ def judge_setup(
                 system, motions, band, system.prior, folds, most_iterations=steps
             )
             error = _errors_with_pose(linearisation, posed) if posed else linearisation.rmse()
-            on_trials = (ModelOnTrial(system, linearisation.p, [motion]) for motion in motions)
-            applied = [band.thin(on_trial.applied) for on_trial in on_trials]
+            applied = [band.thin(on_trial.applied) for on_trial in linearisation.fitted]
             size, used = rms(applied, linearisation.used), np.concatenate(linearisation.used)
             sums = np.sum(np.concatenate(applied), axis=0, where=used)
             middle = sums / np.maximum(used.sum(axis=0), 1)
-            varied = rms([force - middle for force in applied], linearisation.used)
+            varied = np.sqrt(np.maximum(size**2 - middle**2, 0.0))
             if not size.all():
                 mass = [system.mass_matrix(m.q, linearisation.p) for m in motions]
                 inertial = map(np.einsum, repeat("tij,tj->ti"), mass, [m.qdd for m in motions])
@@ -112,8 +111,7 @@ def judge_setup(
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
         moving = np.mean(used, axis=0)
-        share = np.where(size > 0.0, error / size, 0.0)
-        share = np.where(moving >= LEAST_MOVING, share, 1.0)
+        share = np.where(moving >= LEAST_MOVING, error / np.maximum(size, 1e-300), 1.0)
         unexplained = np.where(varied > _EVEN * size, error / varied, 0.0)
     if not np.isfinite(share).all():
         return None
