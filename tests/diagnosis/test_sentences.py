@@ -116,9 +116,7 @@ def test_what_is_doubted_left_or_of_another_axis_is_said() -> None:
     assert say("unknown_effect", {(): 1.0}).endswith(f"Its shape: {SHAPE}.")
     assert "Its shape" not in say("unknown_effect", {(): 1.0}, shape="")
     assert "the library" not in say("unknown_effect", {(): 1.0}, cut_short=True)
-    ranked = {"effect": C, "axis": "joint", "held_out_rmse_before": 1.0, "held_out_rmse_after": 0.2,
-              "indistinguishable_from": (), "p_value": 0.0, "parameters": {}, "probability": 0.07,
-              "unit": "N.m"}  # fmt: skip
+    ranked = {"effect": C, "axis": "joint"}
     open_sets = {(A,): 0.5, (B,): 0.43, (C,): 0.07}
     said = say("undecided", open_sets, probabilities={A: 0.5, B: 0.43}, ranking=[ranked])
     assert "b:joint (0.43) and c:joint (0.07)" in said and "nothing" not in said

@@ -212,7 +212,6 @@ REVERSED = np.array([1.0, -1.0, 1.0, 1.0])
 def test_rounding_errors_of_a_point_mass_on_its_axis_are_no_torque() -> None:
     """Such a body needs none: taken for one, they gave a unit that was wrong by 1e15."""
     robot, motion = arm().model.device.robot, motions(1.0, 2.0)[0]
-    assert robot is not None
     point = {"center": (0.0, 0.0, 0.15), "inertia": (0.0,) * 6}
     last = robot.joints[-1].model_copy(update=point)
     robot = robot.model_copy(update={"joints": (*robot.joints[:-1], last)})
