@@ -263,7 +263,7 @@ def _filled(
     }
     if slides:
         found["constants"] = {
-            "metre": {"value": 1.0, "unit": "m", "source": "a joint that slides feels a force"}
+            "metre": {"value": 1.0, "unit": "m", "sd": 0.0, "source": "a slide feels a force"}
         }
     return found
 

@@ -85,7 +85,9 @@ def open_search(
         known: a search beside another model, whose equal columns are reused.
     """
     wanted = only or session.candidate_names(fit.spec, without)
-    candidates = {c.name: c for c in candidates_of(fit.spec, wanted)}
+    axes, found = fit.linearisation.system.coordinates, candidates_of(fit.spec, wanted)
+    at_rest = {a for a, own in zip(axes, fit.likelihood.samples, strict=True) if not len(own.rows)}
+    candidates = {c.name: c for c in found if at_rest.isdisjoint(c.system.model.effects[-1].axes)}
     # The shapes of a candidate are shares of its range, which therefore must not change.
     scale = known.dictionary.scale if known else MachineScale.of_trials(fit.linearisation)
     dictionary = Dictionary(fit.linearisation, fit.likelihood.samples, candidates, scale)

@@ -210,11 +210,10 @@ class _ModelWithout:
             b = taken[:, -1] - taken[:, :-1] @ c
             squares = self.yy + 2.0 * self.by @ b + (self.bb @ b) @ b
             squares[axis] += 2.0 * (xy + bx.T @ b) @ c + c @ xx @ c
-            weight = p.independent / np.maximum(squares, 1e-9 * self.yy + 1e-300)
+            left = np.maximum(squares, 1e-9 * self.yy + 1e-300)
+            weight = p.independent / left
         moved = self.fixed + self.free @ b
-        cost = p.fixed_cost + float(
-            p.independent @ (0.5 * np.log(p.independent / weight / p.count))
-        )
+        cost = p.fixed_cost + 0.5 * float(p.independent @ np.log(left / p.count))
         cost += 0.5 * float(moved @ p.precision @ moved) - float(p.moment @ moved)
         cost += 0.5 * float(c @ (known * c))
         cost += 0.5 * float(np.linalg.slogdet(np.eye(len(at)) + inside / known)[1])

@@ -56,6 +56,10 @@ def _find_nearest(system: System, squares: SquaresFit, places: Array, nominal: A
     # The drawing determines the combinations that no motion shows.
     of_drawing = [system.parameters[k].sd ** -2.0 for k in unseen]
     weight = block_diag(squares.information, np.diag(of_drawing))
+    # Friction and drives that no motion shows stay where the fit left them.
+    for row, k in enumerate(squares.free[squares.free < len(system.parameters)]):
+        item = system.parameters[k]
+        weight[row, row] += 0.0 if item.weighed or not item.sd else item.sd**-2.0
     at = np.full(len(weight), -1)  # without the nuisance parameters
     at[:count], at[len(at) - unseen.size :] = squares.free, unseen
     value, low, high = np.zeros(len(at)), np.full(len(at), -np.inf), np.full(len(at), np.inf)

@@ -47,10 +47,8 @@ def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate
     """Add the calibration to the covariance of an estimate, and report it as a separate term."""
     if not moved:
         return estimate
-    added = sum(
-        (np.outer(step, step) for step in moved.values()), np.zeros_like(estimate.covariance)
-    )
-    parts = np.sqrt(np.diag(added))
+    steps = np.array([*moved.values()])
+    added, parts = steps.T @ steps, np.linalg.norm(steps, axis=0)
     details = [
         {**entry, "calibration_sd": part, "statistical_sd": sd}
         for entry, part, sd in zip(estimate.details, parts, estimate.sd, strict=True)

@@ -155,7 +155,7 @@ class SquaresFit:
             seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), _PERIODS / min(band.cutoff_hz)
         )
         samples = lay_out_samples(self.fit.linearisation, min(self.block_s, most))
-        tailed = [_TAILED if np.ptp(root) > 0.0 else 1.0 for root in self.fit.likelihood.root]
+        tailed = [_TAILED if np.any(root != root[:1]) else 1.0 for root in self.fit.likelihood.root]
         rows = ((x, left / by) for (x, left), by in zip(self.rows, tailed, strict=True))
         independent = [s.independent * by**2 for s, by in zip(samples, tailed, strict=True)]
         found = covariance_by_blocks(rows, pose.precision, [s.block for s in samples], independent)
@@ -202,14 +202,13 @@ class SquaresFit:
 
         In a single trial, a period of the band on either side is left out as well.
         """
-        band, groups = self.trials.band, self.trials.folds.groups
+        band, groups = self.trials.band, np.array(self.trials.folds.groups)
         if len(self.parts) == 1:
             return [np.zeros(self.free.size)]
         if len(groups) > 1:
-            others = {group: np.array(groups) != group for group in groups}
             found = {
-                group: self._move_to([s[kept].sum(axis=0) for s in self.by_trial])
-                for group, kept in others.items()
+                each: self._move_to([s[groups != each].sum(axis=0) for s in self.by_trial])
+                for each in np.unique(groups)
             }
             return [found[group] for group in groups]
         t, *blocks = (m.t[band.thinned_rows(len(m.t))] for m in (*self.trials.motions, *self.parts))

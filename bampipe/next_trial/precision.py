@@ -86,7 +86,7 @@ class Precision:
         timed = identified.input_timing.limit > 0.0
         full = np.append(p, identified.input_timing.estimate)
         scatter = identified.residual_sd or {}
-        weight = np.array([scatter.get(axis, 1.0) ** -2.0 for axis in system.coordinates])
+        weight = np.array([(scatter.get(axis) or 1.0) ** -2.0 for axis in system.coordinates])
         weight *= band.independent_share
 
         def pose(motion: Motion) -> Problem:

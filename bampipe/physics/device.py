@@ -71,7 +71,7 @@ class Constant(Declaration):
     value: float = Field(gt=-MAX_NUMBER, lt=MAX_NUMBER, description="In its unit")
     unit: str = Field(default="", description="Coherent SI; empty for a pure number")
     source: str = Field(default="", description="Where it comes from")
-    sd: NotNegative | None = Field(default=None, description="Its standard uncertainty")
+    sd: NotNegative | None = Field(default=None, description="Standard uncertainty; 0 if exact")
     description: str = Field(default="", description="Meaning, in a few words")
 
 

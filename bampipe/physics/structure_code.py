@@ -36,19 +36,20 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
         factors += _collect_factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
     for expr in (*e.applied, *e.other, *e.rates, *e.offset):
         factors += _collect_factors(expr, motion, set(names))
-    known_symbols: set[Any] = set()
+    exact = {symbol for symbol, c in constants.items() if model.device.constants[c].sd == 0.0}
+    known_symbols = exact
     while True:
         open_factors = _select_distinct([_strip_known(f, known_symbols) for f in factors])
         new_symbols = {next(iter(f.free_symbols)) for f in open_factors if len(f.free_symbols) == 1}
         new_symbols = new_symbols or _find_determined(open_factors)
         if not new_symbols:
             break
-        known_symbols |= new_symbols
+        known_symbols = known_symbols | new_symbols
     at = {symbol: model.device.constants[name].value for symbol, name in constants.items()}
     numbers: list[Any] = [
         [name, at[symbol], model.device.constants[name].unit]
         for symbol, name in constants.items()
-        if symbol in known_symbols
+        if symbol in known_symbols - exact
     ]
     pivots: list[str] = [name for name, *_ in numbers]
     groups = []

@@ -157,12 +157,15 @@ class DiagnoseResult(Result, file="models/{model}/diagnose.json", stage="diagnos
     def sets_on(self, axis: str) -> list[tuple[Names, float]]:
         """Return the sets restricted to one axis, the most probable first.
 
+        A set that holds improbable effects alone on the axis keeps these: it is not "nothing".
         `UNKNOWN` is a member where it is an open question whether something unknown is missing.
         """
         entry, found = self.axes[axis], dict[Names, float]()
+        axis_of = {each.effect: each.axis for each in self.ranking}
         open_question = entry.standing == "above_floor" and not entry.remains
         for one in self.sets:
             here = tuple(name for name in entry.probabilities if name in one.effects)
+            here = here or tuple(name for name in one.effects if axis_of.get(name) == axis)
             here += (UNKNOWN,) * (open_question and one.unknown == axis)
             found[here] = found.get(here, 0.0) + one.probability
         return sorted(found.items(), key=lambda pair: -pair[1])

@@ -290,12 +290,12 @@ class Losses:
         held = values > 1e-9 * values.max(initial=1e-300)
         power = left[:, held] @ (right[held] @ (powers / size) / values[held])
         rest = drive - left[:, held] @ (left[:, held].T @ drive)
-        spread = np.var(drive) if has_offset else np.mean(drive**2)
+        middle = drive.sum() / max(len(drive), 1) if has_offset else 0.0
         return cls(
             left[:, held],
             power,
             rest,
-            max(float(np.nan_to_num(spread)), 1e-300),
+            max(_mean_square(drive - middle), 1e-300),
             float(power @ drive),
             bool(len(held)) and bool(held.all()),
         )
@@ -319,21 +319,20 @@ class Losses:
         square, whole = (float(by_part @ of @ by_part) for of in sums[:2])
         along, power = (float(of @ by_part) for of in sums[2:])
         left, count = float(self.drive @ self.drive), max(len(self.drive), 1)
-        if not self.known or square <= 1e-18 * max(whole, 1e-300):
-            return Drive(0.0, np.inf, left / count / self.size, 0.0)
-        share = along / square
+        # Losses alone may explain all that is required, as the mass of a slide by its drive's.
+        inverse = self.known / square if square > 1e-18 * max(whole, 1e-300) else 0.0
+        share = along * inverse
         mean_square = max(left - share * along, 0.0) / count
         # Errors of neighbouring samples are correlated: about one sample in ten is independent.
         variance = 10.0 * mean_square
-        power_sd = np.sqrt(variance * (float(self.power @ self.power) + power**2 / square))
+        power_sd = np.sqrt(variance * (float(self.power @ self.power) + power**2 * inverse))
         taken = direction * (self.taken - share * power)
-        held = min(max(share, bounds[0]), bounds[1])
-        held_left = mean_square + (held - share) ** 2 * square / count
+        held = min(max(share, bounds[0]), bounds[1]) if inverse else 0.0
         return Drive(
             share,
-            float(np.sqrt(variance / square)),
-            held_left / self.size,
-            float(taken / max(power_sd, 1e-300)),
+            float(np.sqrt(variance * inverse)) if inverse else np.inf,
+            (mean_square + (held - share) ** 2 * square / count) / self.size,
+            float(self.known * taken / max(power_sd, 1e-300)),
         )
 
 
@@ -363,10 +362,10 @@ def find_heavy(compared: Comparison, mounting: Mounting) -> HeavierBody | None:
     if not mounting.gravity.any():
         return None
     drives, bodies = _signed_drives(compared, mounting), compared.by_body(mounting)
-    size = [max(float(np.mean(drive**2)), np.finfo(float).tiny) for drive in drives]
+    size = [max(_mean_square(drive), np.finfo(float).tiny) for drive in drives]
 
     def misfit(left: Sequence[Array]) -> Array:
-        shares = [float(np.mean(rest**2)) / s for rest, s in zip(left, size, strict=True)]
+        shares = [_mean_square(rest) / s for rest, s in zip(left, size, strict=True)]
         return np.log(np.array(shares) + _LEAST_LEFT)
 
     whole = [columns.sum(axis=1) for columns in bodies]
@@ -382,15 +381,20 @@ def find_heavy(compared: Comparison, mounting: Mounting) -> HeavierBody | None:
             best = score, HeavierBody(place, 1.0 + change), left
     if best is None:
         return None
-    share = sum(float(np.mean(one**2)) for one in best[2]) / sum(size)
+    share = sum(map(_mean_square, best[2])) / sum(size)
     return best[1] if share < _EXPLAINED else None
+
+
+def _mean_square(values: Array) -> float:
+    """Mean square of samples (K,), 0 without any."""
+    return float(values @ values) / max(len(values), 1)
 
 
 def _fitted(
     rest: Sequence[Array], columns: Sequence[Array], size: Sequence[float]
 ) -> tuple[float, list[Array]]:
     """Return the coefficient of a column, (K,) by joint, nearest to ``rest``, and the remainder."""
-    weights = [1.0 / (s * len(one)) for s, one in zip(size, rest, strict=True)]
+    weights = [1.0 / (s * max(len(one), 1)) for s, one in zip(size, rest, strict=True)]
     along = sum(w * float(c @ r) for w, c, r in zip(weights, columns, rest, strict=True))
     square = sum(w * float(c @ c) for w, c in zip(weights, columns, strict=True))
     change = along / max(square, np.finfo(float).tiny)
@@ -451,12 +455,7 @@ def describe_heavy(
 
 def with_heavier_body(robot: Robot, found: HeavierBody) -> Robot:
     """The robot with the mass and inertia of a body multiplied by the factor found."""
-    joints = list(robot.joints)
-    one = joints[found.place]
-    joints[found.place] = one.model_copy(
-        update={
-            "mass": found.factor * one.mass,
-            "inertia": tuple(found.factor * number for number in one.inertia),
-        }
-    )
+    joints, one = list(robot.joints), robot.joints[found.place]
+    more = {"mass": found.factor * one.mass, "inertia": tuple(found.factor * np.array(one.inertia))}
+    joints[found.place] = one.model_copy(update=more)
     return robot.model_copy(update={"joints": tuple(joints)})

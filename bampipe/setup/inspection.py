@@ -252,7 +252,7 @@ def _find_placeholders(system: System, session: IngestResult) -> dict[str, tuple
     used = {node.id for node in nodes if isinstance(node, ast.Name)}
     inputs = tuple(name for name in (*device.forces, *device.channels) if name in used)
     for name, constant in device.constants.items():
-        if name in used and constant.value == 1.0 and constant.unit:
+        if name in used and constant.value == 1.0 and constant.unit and constant.sd is None:
             source = f", source {constant.source!r}" if constant.source else ""
             found[f"{name} of the device file is 1 {constant.unit}{source}"] = inputs
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from bampipe.physics.parameter import Parameter
 from bampipe.trials.folds import Folds
 from bampipe.trials.linearisation import Linearisation, linearise_fit
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import ModelOnTrial, rms
+from bampipe.trials.residuals import rms
 
 WEIGHT = 8.0
 """Weight of the logarithm of an axis' error: a third of the error counts as much as a parameter
@@ -40,9 +41,9 @@ class Plausibility:
     """Result of a least-squares fit of the bare device under one set-up.
 
     Attributes:
-        error: of the fit by axis, relative to the applied force, (n_q,); 1 if the axis hardly
-            moves, 0 if nothing is applied. Mistakes are so gross that the fit shows them; held-out
-            trials would be extrapolated from a few slow ones that determine little.
+        error: of the fit by axis, relative to the applied force, or to that of inertia if nothing
+            is applied, (n_q,); 1 if the axis hardly moves. Mistakes are so gross that the fit shows
+            them; held-out trials would be extrapolated from a few slow ones that determine little.
         moving: fraction of the samples in which each axis moves, (n_q,).
         p: parameters, (n_p,).
         objections: half the squared distance of each parameter from its prior, in prior
@@ -98,15 +99,19 @@ def judge_setup(
                 system, motions, band, system.prior, folds, most_iterations=steps
             )
             error = _errors_with_pose(linearisation, posed) if posed else linearisation.rmse()
-            on_trials = (ModelOnTrial(system, linearisation.p, [motion]) for motion in motions)
-            applied = [band.thin(on_trial.applied) for on_trial in on_trials]
+            applied = [band.thin(on_trial.applied) for on_trial in linearisation.fitted]
             size, used = rms(applied, linearisation.used), np.concatenate(linearisation.used)
-            varied = np.std(np.concatenate(applied), axis=0, where=used)
+            sums = np.sum(np.concatenate(applied), axis=0, where=used)
+            middle = sums / np.maximum(used.sum(axis=0), 1)
+            varied = np.sqrt(np.maximum(size**2 - middle**2, 0.0))
+            if not size.all():
+                mass = [system.mass_matrix(m.q, linearisation.p) for m in motions]
+                inertial = map(np.einsum, repeat("tij,tj->ti"), mass, [m.qdd for m in motions])
+                size = np.where(size > 0.0, size, rms(map(band.thin, inertial), linearisation.used))
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
         moving = np.mean(used, axis=0)
-        share = np.where(size > 0.0, error / size, 0.0)
-        share = np.where(moving >= LEAST_MOVING, share, 1.0)
+        share = np.where(moving >= LEAST_MOVING, error / np.maximum(size, 1e-300), 1.0)
         unexplained = np.where(varied > _EVEN * size, error / varied, 0.0)
     if not np.isfinite(share).all():
         return None

@@ -260,8 +260,7 @@ class Search:
 
     def _shortlist(self, chosen: Corrections, tried: Iterable[Correction]) -> list[Correction]:
         """Return the best corrections on the small part of the trials."""
-        screened = [(self.screen(chosen, correction), correction) for correction in tried]
-        screened.sort(key=lambda one: one[0])
+        screened = sorted(((self.screen(chosen, c), c) for c in tried), key=lambda pair: pair[0])
         return [one for score, one in screened[:_SHORTLIST] if math.isfinite(score)]
 
     @property

@@ -64,7 +64,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     session = read_session(Path(config.session))
     device = session_device(session)
     if device.drive:
-        # A command to a motor, unlike a sensor, may be constant or at its limit for long.
+        # A command to a motor may be constant or at its limit for long, and motors hold axes.
         config = replace(config, frozen_share=1.0, saturated_share=1.0)
     (out / "ingest").mkdir(parents=True, exist_ok=True)
     channels = ChannelRecords(session, device)

@@ -48,11 +48,11 @@ class ChannelRecords:
                 self._hum[name].append(found)
 
     def measure_noise(self, trial: CleanTrial) -> None:
-        """Measure the noise of a trial's encoders (``q_<axis>``) and inputs."""
+        """Measure the noise of a trial's encoders (``q_<axis>``) and inputs, unless they rest."""
         columns = {
             name: np.asarray(values, dtype=float)
             for name, values in trial.columns.items()
-            if not name.startswith("brake_")
+            if not name.startswith("brake_") and np.any(values != values[0])
         }
         readings = {name: x for name, x in columns.items() if name.startswith("q_")}
         inputs = {name: x for name, x in columns.items() if name not in readings}

@@ -248,7 +248,6 @@ def test_a_table_of_denavit_and_hartenberg_is_the_same_robot(tmp_path: Path) -> 
     urdf, table = tmp_path / "urdf.toml", tmp_path / "dh.toml"
     urdf.write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\ngravity = [1.0, -9.0, 0.0]\n')
     bodies = device_from(read_device_file(urdf)).robot
-    assert bodies is not None
     rows = [
         f"[robot.dh.{joint.name}]\na = 0.5\nmass = {joint.mass}\n"
         f"center = [{joint.center[0] - 0.5}, 0.0, 0.0]\ninertia = {list(joint.inertia)}\n"
@@ -359,7 +358,6 @@ def test_a_joint_that_follows_another_moves_with_it(tmp_path: Path) -> None:
         forces.append(system.required(at, qd @ by.T, qdd @ by.T, *none, p) @ by)
     np.testing.assert_allclose(forces[0], forces[1], rtol=0.0, atol=1e-11)
     robot = held.model.device.robot
-    assert robot is not None
     drawn = robot.drawn_forces(q, qd, qdd, np.array(robot.gravity))
     np.testing.assert_allclose(drawn, forces[0], rtol=0.0, atol=1e-11)
 

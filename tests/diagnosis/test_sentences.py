@@ -23,7 +23,7 @@ def made(verdict: str, sets: Sets, before=1.0, after=0.104, floor=0.1, **more) -
         "rmse_beyond_bias": 0.0831, "standing": compare_with_floor(after, floor), "unit": "N.m",
         "explained": 0.98837, "unknown": 0.0312, "remains": verdict == "unknown_effect",
     }  # fmt: skip
-    whole = {k: more.pop(k) for k in ("cut_short", "worst_windows") if k in more}
+    whole = {k: more.pop(k) for k in ("cut_short", "ranking", "worst_windows") if k in more}
     content = {**diagnosis({"joint": axis | more}, sets), **whole}
     return DiagnoseResult.model_validate(filled(DiagnoseResult, content))
 
@@ -116,6 +116,10 @@ def test_what_is_doubted_left_or_of_another_axis_is_said() -> None:
     assert say("unknown_effect", {(): 1.0}).endswith(f"Its shape: {SHAPE}.")
     assert "Its shape" not in say("unknown_effect", {(): 1.0}, shape="")
     assert "the library" not in say("unknown_effect", {(): 1.0}, cut_short=True)
+    ranked = {"effect": C, "axis": "joint"}
+    open_sets = {(A,): 0.5, (B,): 0.43, (C,): 0.07}
+    said = say("undecided", open_sets, probabilities={A: 0.5, B: 0.43}, ranking=[ranked])
+    assert "b:joint (0.43) and c:joint (0.07)" in said and "nothing" not in said
     both = {(A, "b:elbow"): 1.0}
     assert "adding all selected effects (a:joint and b:elbow) takes" in say("missing", both)
     clean = say("nothing_missing", {("b:elbow",): 1.0}, before=0.104)

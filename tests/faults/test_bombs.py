@@ -186,7 +186,6 @@ def reader() -> Iterator[subprocess.Popen[str]]:
         env={**os.environ, "MALLOC_ARENA_MAX": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"},
     ) as process:  # fmt: skip
         yield process
-        assert process.stdin is not None
         process.stdin.close()
 
 

@@ -223,7 +223,6 @@ def test_a_hand_moves_no_faster_than_hands_do():
     }
     motion = Motion("t01", t, q, qd, np.ones_like(q), np.zeros_like(q), channels)
     seen = Envelope.of_trials([motion], system, system.prior)
-    assert seen.wider is not None
     highest = 0.6 * seen.wider.speed
     # At the end of a rod of 1.1 m, half a metre a second.
     assert highest[0] == pytest.approx(0.5 / 1.1, rel=0.02)

@@ -48,15 +48,12 @@ def test_bad_requests_are_refused_in_one_line(run):
 def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(root, run):
     names = ("coulomb.joint", "viscous.joint", "inertia", "moment")
     found, path = propose(run, purpose="coulomb.joint", seconds=12.0, plan=True, sd=0.002)
-    assert found.plan is not None
     sheet = (path.parent / "protocol.pdf").read_bytes()
     assert sheet.startswith(b"%PDF")
     assert found.plan.seconds == sum(one.times * one.seconds for one in found.plan.trials)
     assert all(found.plan.sd[n].after < found.plan.sd[n].before for n in names)
     easy, _ = propose(run, purpose="coulomb.joint", seconds=12.0, plan=True, sd=0.9)
-    assert easy.plan is not None
-    assert easy.plan.is_enough
-    assert easy.plan.trials == ()
+    assert easy.plan.is_enough and easy.plan.trials == ()
     # Another question leaves the first forecast as it was, until its trial has come.
     other, _ = propose(run, purpose="viscous.joint", seconds=12.0)
     assert read_forecasts(run.root, "base") == (other, easy)

@@ -141,7 +141,6 @@ def test_a_trial_is_suggested_that_tells_apart_what_small_motion_does_not():
     twice = comparison.contrasts(comparison.sums_now.scale_by(2.0))[0, 1].distance
     assert twice == pytest.approx(2.0 * comparison.contrasts_now[0, 1].distance, rel=0.05)
     found = suggest_trial(session, final, asked)
-    assert found is not None
     assert found.axis == "yaw"
     assert found.design.startswith("Move yaw")
     assert found.confusion < 0.1 < found.confusion_now == pytest.approx(0.4)

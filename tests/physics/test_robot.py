@@ -57,7 +57,6 @@ class Reference:
 
     def __init__(self, device: Device) -> None:
         robot = device.robot
-        assert robot is not None
         self.model = pin.Model()
         self.model.gravity.linear = np.array(robot.gravity)
         places = {"": 0}
@@ -134,7 +133,6 @@ def test_models_of_a_robot_share_compiled_bodies_whose_columns_add_up() -> None:
         assert len(set(texts)) == 2
         assert not any("inertia" in text or "r_9 =" in text for text in texts)
     device = random_robot(4, seed=9)
-    assert device.robot is not None
     system, n = compile_model(Model(device)), 4
     rows = device.robot.regressor.reshape(n, -1, 10 * n)
     rng = np.random.default_rng(0)
@@ -161,14 +159,12 @@ def test_a_number_that_moves_no_joint_is_not_estimated() -> None:
 
 def test_impossible_bodies_are_named() -> None:
     device = random_robot(3, seed=3)
-    assert device.robot is not None
     assert device.robot.impossible == []
     joints = {name: dict(j) for name, j in device.declaration["robot"]["joints"].items()}
     joints["j0"]["mass"] = -1.0
     joints["j1"]["inertia"] = [1.0, 0.0, 0.0, 0.1, 0.0, 0.1]
     joints["j2"]["inertia"] = [1.0, 0.0, 0.0, -1.0, 0.0, 1.0]
     wrong = device_from({**device.declaration, "robot": {"joints": joints}}).robot
-    assert wrong is not None
     first, second, third = wrong.impossible
     assert first == "j0: a mass of -1 kg"
     assert "largest moment exceeds the sum" in second
@@ -190,7 +186,6 @@ def test_a_body_that_is_not_drawn_may_be_one() -> None:
     joints = {name: dict(j) for name, j in device.declaration["robot"]["joints"].items()}
     joints["j1"] |= {"mass": 0.0, "center": [0.0, 0.0, 0.0], "inertia": [0.0] * 6}
     robot = device_from({**device.declaration, "robot": {"joints": joints}}).robot
-    assert robot is not None
     assert robot.undrawn == ["j1"] and robot.impossible == []
     sd = {p.name: p.sd for p in robot.parameters}
     heaviest = sum(joint.mass for joint in robot.joints)

@@ -61,6 +61,8 @@ def test_any_device_is_understood_and_what_hides_another() -> None:
         "g mass sin(tilt)",
         "mass + 2 pulley_inertia/pulley_radius^2",
     }
+    exact = registry.device_from(tomllib.loads(RAIL.replace("= 9.81", "= 9.81, sd = 0.0")))
+    assert "mass sin(tilt)" in structure(compile_model(Model(exact))).together[0].combinations
     assert structure(compile_model(Model(registry.device("slider")))).together == ()
     # Sympy cannot tell that the logarithm of the saturation is real.
     effects = ("channel_saturation:supply", "drive_sag:joint")

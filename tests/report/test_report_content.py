@@ -281,7 +281,6 @@ def test_what_did_not_run_along_the_data_has_no_picture_of_its_convergence(own_r
 def test_the_drift_of_a_model_is_a_table_and_its_absence_a_sentence(own_run: Path) -> None:
     results = Results(own_run)
     validated = results.read(ValidateResult)
-    assert validated is not None
     why = "Within 0.5 s the model drifts farther than the axis moves."
     step = {"horizon_s": 0.1, "median": 0.0012, "quantile_90": 0.0034, "displacement": 0.2}
     drift = {"unit": "rad", "horizons": [step | {"windows": 40}], "reason": why}

@@ -12,7 +12,7 @@ from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
 from bampipe.setup.drawn_bodies import Comparison, JointMotion
 from bampipe.setup.hypotheses import scale_correction
-from bampipe.setup.plausibility import Plausibility
+from bampipe.setup.plausibility import Plausibility, judge_setup
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch
 from bampipe.setup.search import Finding, shorten
 from bampipe.setup.turned_trials import find_turned_trials
@@ -160,6 +160,12 @@ def turned(factor: float, zero: float, joint: int, drive: float) -> list[Motion]
     return found
 
 
+def test_a_drive_that_reads_nothing_explains_no_motion() -> None:
+    search = search_in(turned(1.0, 0.0, 1, 0.0))
+    held = judge_setup(search.system, search.motions, search.band, search.folds, 4)
+    assert held is not None and (held.left > 0.5).tolist() == [False, True, False, False]
+
+
 @pytest.mark.parametrize(
     ("given", "named"),
     [
@@ -206,7 +212,6 @@ REVERSED = np.array([1.0, -1.0, 1.0, 1.0])
 def test_rounding_errors_of_a_point_mass_on_its_axis_are_no_torque() -> None:
     """Such a body needs none: taken for one, they gave a unit that was wrong by 1e15."""
     robot, motion = arm().model.device.robot, motions(1.0, 2.0)[0]
-    assert robot is not None
     point = {"center": (0.0, 0.0, 0.15), "inertia": (0.0,) * 6}
     last = robot.joints[-1].model_copy(update=point)
     robot = robot.model_copy(update={"joints": (*robot.joints[:-1], last)})

@@ -207,7 +207,6 @@ def test_follows_a_growing_file_until_told_to_stop(run: RunFolder, tmp_path: Pat
         # Tests run in the background by a shell inherit that Ctrl-C is ignored.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
-    assert process.stdout is not None
     first = json.loads(process.stdout.readline())
     with log.open("a") as file:
         file.write(lines[1500][20:] + "not a line\n" + "".join(lines[1501:3001]))

@@ -86,7 +86,8 @@ def log(columns: dict[str, np.ndarray], delimiter=",", decimal=".", form="{:.6f}
 PLAIN = {"encoder": 'column = "q", unit = "rad"', "current": 'column = "i", unit = "A"'}
 
 
-def check(samples: pd.DataFrame) -> None:
+def check(samples: pd.DataFrame, trial: pd.Series) -> None:
+    assert trial["status"] == "ok"
     np.testing.assert_allclose(samples["t"], T, atol=2e-6)
     np.testing.assert_allclose(samples["q_joint"], Q, atol=2e-5)
     np.testing.assert_allclose(samples["current"], I, atol=2e-5)
@@ -101,9 +102,9 @@ def test_degrees_milliamperes_and_decimal_commas(tmp_path):
         encoder='column = "winkel [deg]", unit = "deg"',
         current='column = "strom [mA]", unit = "mA"',
     )
-    check(samples)
+    check(samples, trial)
     assert about["channels"]["current"]["unit"] == "A"
-    assert trial["status"] == "ok" and "decimal commas" in trial["repairs"]
+    assert "decimal commas" in trial["repairs"]
     assert "time stamps jitter by" in trial["repairs"] and "cubic spline" in trial["repairs"]
 
 
@@ -121,8 +122,7 @@ def test_degrees_milliamperes_and_decimal_commas(tmp_path):
 def test_clocks(tmp_path, stamps, unit):
     time, text = f'column = "t"\nunit = "{unit}"', log({"t": stamps, "q": Q, "i": I})
     samples, trial, _ = ingested(tmp_path, text, time=time, **PLAIN)
-    check(samples)
-    assert trial["status"] == "ok"
+    check(samples, trial)
 
 
 def test_seconds_and_nanoseconds_in_two_columns(tmp_path):
@@ -131,8 +131,7 @@ def test_seconds_and_nanoseconds_in_two_columns(tmp_path):
     text = log({**form, "q": Q, "i": I})
     time = 'column = "sec"\nunit = "s"\nnanoseconds = "nano"'
     samples, trial, _ = ingested(tmp_path, text, time=time, **PLAIN)
-    check(samples)
-    assert trial["status"] == "ok"
+    check(samples, trial)
     with pytest.raises(InputError, match=r'time\.nanoseconds: only for unit = "s"'):
         ingested(tmp_path, text, time=time.replace('"s"', '"ms"'), **PLAIN)
 
@@ -183,7 +182,7 @@ def test_a_recorded_velocity_checks_the_position(tmp_path, velocity, said):
             ingested(tmp_path, text, **options)
         return
     samples, trial, _ = ingested(tmp_path, text, **options)
-    check(samples)
+    check(samples, trial)
     assert list(samples) == ["trial_id", "t", "q_joint", "current"]
     assert (said in trial["repairs"]) and ("velocity" in trial["repairs"]) == bool(said)
 
@@ -208,7 +207,7 @@ def test_units_that_contradict_the_file_are_refused(tmp_path, change, said):
         "encoder": 'column = "q [deg]", unit = "deg"',
         "current": 'column = "i [mA]", unit = "mA"',
     }
-    check(ingested(tmp_path / "right", text, **right)[0])
+    check(*ingested(tmp_path / "right", text, **right)[:2])
     with pytest.raises(InputError) as caught:
         ingested(tmp_path / "wrong", text, **{**right, **change})
     assert said in str(caught.value) and "\n" not in str(caught.value)
@@ -236,7 +235,6 @@ def test_units_that_contradict_the_file_are_refused(tmp_path, change, said):
 )  # fmt: skip
 def test_units_of_logs(text, si, scale):
     found = unit(text)
-    assert found is not None
     assert found.si == si and found.scale == pytest.approx(scale)
 
 

@@ -17,10 +17,11 @@ from bampipe.errors import InputError
 from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.robot import Motor
-from bampipe.setup.drawn_bodies import Drive
+from bampipe.setup.drawn_bodies import WIDE, Drive, Losses
 from bampipe.setup.proposal import ProposedSession, propose, write_proposal
 from bampipe.setup.proposal.notes import COLUMNS
 
+Pair = tuple[float, float]
 URDF = """<?xml version="1.0"?><robot name="arm">
 <link name="base"/>
 <link name="upper"><inertial><origin xyz="0.25 0 0"/><mass value="3"/>
@@ -34,9 +35,7 @@ URDF = """<?xml version="1.0"?><robot name="arm">
 </joint></robot>"""
 
 
-def write_log(
-    folder: Path, gains: tuple[float, float] = (1.0, 1.0), swing: float = 1.0
-) -> pd.DataFrame:
+def write_log(folder: Path, gains: Pair = (1.0, 1.0), swings: Pair = (1.0, 1.0)) -> pd.DataFrame:
     """A log of both joints at 200 Hz, 20 s; ``gains``: of the logged torque over the joint's."""
     (folder / "arm.urdf").write_text(URDF)
     (folder / "x.toml").write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
@@ -46,7 +45,7 @@ def write_log(
     t = np.arange(4000) / 200.0
     waves = ((0.7, 1.1, 0.3), (0.5, 1.7, 1.1))
     q, qd, qdd = (
-        np.column_stack([swing * f(a, 2 * np.pi * h * 0.3, p) for a, h, p in waves])
+        swings * np.column_stack([f(a, 2 * np.pi * h * 0.3, p) for a, h, p in waves])
         for f in (
             lambda a, w, p: a * np.sin(w * t + p),
             lambda a, w, p: a * w * np.cos(w * t + p),
@@ -81,9 +80,7 @@ def proposed(folder: Path) -> ProposedSession:
 
 def motors_of(folder: Path) -> dict[str, Motor]:
     """The motors in the proposed device file."""
-    robot = registry.device_from(read_device_file(folder / "device.toml")).robot
-    assert robot is not None
-    return robot.motors
+    return registry.device_from(read_device_file(folder / "device.toml")).robot.motors
 
 
 def about(proposal: ProposedSession, column: str) -> list[str]:
@@ -115,6 +112,27 @@ def test_where_next_to_nothing_hangs_on_a_joint_friction_tells_the_sign(
     assert scale == gain
 
 
+def test_an_axis_that_its_drive_holds_keeps_its_priors(tmp_path: Path) -> None:
+    write_log(tmp_path, swings=(1.0, 0.0))
+    proposed(tmp_path)
+    run = bampipe.run_session(tmp_path, runs=tmp_path / "runs", pipeline="diagnose")
+    found = read_json(run.root / "models/base/identify.json")["parameters"]
+    held = [found[f"{name}.elbow"] for name in ("viscous", "coulomb")]
+    assert all(abs(one["estimate"]) <= 1e-6 * one["sd"] for one in held), held
+    axes = read_json(run.root / "models/base/diagnose.json")["axes"]
+    assert [axes[k]["verdict"] for k in ("shoulder", "elbow")] == ["nothing_missing", "no_verdict"]
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_slide_whose_mass_its_drive_may_have_is_turned_by_friction_alone(way: float) -> None:
+    rate, change = np.random.default_rng(0).normal(size=(2, 500))
+    columns = np.column_stack([change, rate, np.sign(rate)])
+    powers = np.array([0.0, np.mean(rate**2), np.mean(np.abs(rate))])
+    losses = Losses.of(columns, powers, way * (columns @ [3.0, 2.0, 1.0]), has_offset=False)
+    held = losses.beside(losses.sums(change[None]), np.ones(1), 1.0, WIDE)
+    assert held.is_turned == (way < 0.0) and held.share == 0.0 and not held.is_sure
+
+
 def test_weight_that_would_make_friction_drive_the_joint_tells_no_sign() -> None:
     drive = Drive(share=-3.8, error=0.5, left=0.3, losses=40.0)
     assert not drive.is_sure and not drive.is_turned
@@ -123,7 +141,7 @@ def test_weight_that_would_make_friction_drive_the_joint_tells_no_sign() -> None
 
 
 def test_a_position_beyond_the_range_is_said_with_what_may_explain_it(tmp_path: Path) -> None:
-    write_log(tmp_path, swing=8.0)
+    write_log(tmp_path, swings=(8.0, 8.0))
     assert any("is the range of the drawing right?" in line for line in proposed(tmp_path).check)
     for name in ("session.toml", "device.toml"):
         (tmp_path / name).unlink()

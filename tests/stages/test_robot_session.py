@@ -33,9 +33,7 @@ def true_robot(folder: Path) -> Robot:
     """The robot as its drawing would be without errors."""
     (folder / "arm.urdf").write_text(arm.urdf(arm.build(KINDS, SEED)))
     (folder / "device.toml").write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
-    robot = device_from(read_device_file(folder / "device.toml")).robot
-    assert robot is not None
-    return robot
+    return device_from(read_device_file(folder / "device.toml")).robot
 
 
 @pytest.mark.slow

@@ -43,13 +43,12 @@ def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
 def fill_missing(table: TrialTable) -> None:
     """Interpolate missing samples, drop them at the ends; what a long run spans is left out."""
     channels = [name for name in table.columns if name != table.clock]
-    some = np.zeros(len(table), dtype=bool)
-    for name in channels:
-        some |= ~np.isfinite(table.columns[name])
+    unknown = {name: ~np.isfinite(table.columns[name]) for name in channels}
+    some = np.logical_or.reduce([*unknown.values()])
     if not some.any():
         return
-    for name in channels:
-        if not np.isfinite(table.columns[name]).any():
+    for name, missing in unknown.items():
+        if missing.all():
             raise table.fault("holds no number at all", column=name)
     sound = np.flatnonzero(~some)
     if len(sound) == 0:
@@ -61,13 +60,11 @@ def fill_missing(table: TrialTable) -> None:
         table.keep(slice(start, stop))
         table.repairs.append(f"{dropped} with missing samples at the ends dropped")
     for name in channels:
-        _refuse_missing(table, name, ~np.isfinite(table.columns[name]))
-    for name in channels:
         values = table.columns[name]
         missing = ~np.isfinite(values)
         if missing.any():
-            known = ~missing
-            values[missing] = np.interp(table.t[missing], table.t[known], values[known])
+            _refuse_missing(table, name, missing)
+            values[missing] = np.interp(table.t[missing], table.t[~missing], values[~missing])
             for start, stop in zip(*find_runs(missing), strict=True):
                 if stop - start > table.limits.nan_run:
                     first, last = table.t[[start, stop - 1]] - table.t[0] + (-_AROUND_S, _AROUND_S)
@@ -87,8 +84,6 @@ def take_out(table: TrialTable, column: str, wild: np.ndarray) -> None:
 
 def _refuse_missing(table: TrialTable, name: str, missing: np.ndarray) -> None:
     count = int(missing.sum())
-    if count == 0:
-        return
     start, length = longest_run(missing)
     lengths = np.subtract(*find_runs(missing)[::-1])
     long = int(lengths[lengths > table.limits.nan_run].sum())

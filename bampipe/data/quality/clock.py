@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.arrays import Array
-from bampipe.data.quality.table import TrialTable, find_runs, in_times
+from bampipe.data.quality.table import TrialTable, find_runs, in_times, longest_run
 from bampipe.data.session import SECONDS
 from bampipe.lists import count_noun
 
@@ -87,11 +87,11 @@ def spread_stamps(t: Array) -> tuple[Array, float]:
     rounding = float(gaps.min()) if len(gaps) else 0.0
     if rounding < COARSEST_STAMP * step:
         return t, 0.0
-    if np.any(np.abs(steps / rounding - np.rint(steps / rounding)) > 0.1):
-        return t, 0.0
     rows, first = np.arange(len(t), dtype=np.float64), np.flatnonzero(steps > 0.0) + 1
+    if len(first) < 2 or np.any(np.abs(steps / rounding - np.rint(steps / rounding)) > 0.1):
+        return t, 0.0
     # All rows of a stamp would tilt the line by where the first and the last stamp are cut.
-    slope, start = np.polyfit(rows[first], t[first] - t[0], 1) if len(first) > 2 else (step, 0.0)
+    slope, start = np.polyfit(rows[first], t[first] - t[0], 1)
     if np.ptp(t - t[0] - slope * rows) <= 1.2 * rounding:
         return t[0] + start + slope * rows, rounding
     if len(first) < 3 or len(t) < 2 * len(first):
@@ -329,12 +329,10 @@ def keep_longest_stretch(table: TrialTable) -> None:
     gaps = np.flatnonzero(steps > limit)
     if len(gaps) == 0:
         return
-    bounds = np.concatenate([[0], gaps + 1, [len(table)]])
-    longest = int(np.argmax(np.diff(bounds)))
-    start, stop = int(bounds[longest]), int(bounds[longest + 1])
+    start, within = longest_run(steps <= limit)
+    stop = start + within + 1
     share = (stop - start) / len(table)
-    widest = float(steps[gaps].max())
-    words = f"{count_noun(len(gaps), 'gap')} of up to {widest:.3g} s in the time stamps"
+    words = f"{count_noun(len(gaps), 'gap')} of up to {steps.max():.3g} s in the time stamps"
     if share < table.limits.sound_share:
         raise table.fault(
             f"{words}, and the longest stretch between them holds {share:.0%} of the samples,"

@@ -174,12 +174,10 @@ def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> No
             )
         for encoder in session.encoders:
             if travel[encoder.name] == 0.0:
-                raise table.fault(
-                    "never changes while other axes move: frozen",
-                    column=encoder.column,
-                    remedy="check the encoder's cable; an axis held in all trials is none of the"
-                    " device: make a robot's joint fixed in its file",
-                )
+                said, remedy = "never changes while other axes move", "check the encoder's cable"
+                if limits.frozen_share < 1.0:
+                    raise table.fault(f"{said}: frozen", column=encoder.column, remedy=remedy)
+                table.notes.append(f"column '{encoder.column}' {said}: is {encoder.name} held?")
         return
     encoder = next(e for e in session.encoders if e.name == entry.locked_axis)
     most = {"rad": limits.locked_rad, "m": limits.locked_m}[encoder.unit]

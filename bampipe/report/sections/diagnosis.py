@@ -189,6 +189,6 @@ def draw_maps(panel: Any, name: str, shown: Sequence[tuple[ResidualMap, str, str
             spread = np.abs(np.vstack([mean - low, high - mean]))
             panel.errorbar(places, mean, spread, color=colour, fmt="o", ms=3, lw=1.0, label=title)
             panel.set_xticks(places, names)
-            panel.set(xlim=(-0.5, len(names) - 0.5), xlabel=split_name(name))
+            panel.set(xlim=(-0.5, max(len(names), 1) - 0.5), xlabel=split_name(name))
     panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
     style.set_limits(panel, bands, zero=True)

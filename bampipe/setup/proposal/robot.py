@@ -401,7 +401,7 @@ def _sentences(
         if share < 0.0:
             said.append(f"its sign is turned; or that of {c.name} is the wrong one")
         if device.force_unit == "A":
-            agreed.append(f"{c.name} {1.0 / size:.3g} N.m/A")
+            agreed.append(f"{c.name} {1.0 / size:.3g} {c.torque_unit}/A")
         elif size >= STATED[1]:
             said.append("another unit, or bodies that are not drawn")
         elif size <= STATED[0]:
