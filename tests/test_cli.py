@@ -183,6 +183,8 @@ def test_a_session_may_be_named_by_its_file(toy: Toy, command: Command) -> None:
     assert command("run", file, *toy.options)[0] == 0
     assert places.find_run(str(file), toy.runs) == toy.root
     assert places.find_sessions([str(toy.session.parent / "*" / "session.toml")]) == [toy.session]
+    with pytest.raises(InputError, match="no session matches"):
+        places.find_sessions([str(toy.session / "*")])
 
 
 def test_off_a_terminal_a_long_stage_prints_a_line_now_and_then(
@@ -247,11 +249,6 @@ def test_a_name_means_the_run_and_a_path_the_folder(
     assert places.find_run("first", toy.runs) == toy.root
     assert places.find_run("./first", toy.runs).resolve() == here / "first"
     assert places.find_run("first", here / "no-runs") == Path("first")
-
-
-def test_pattern_without_a_session(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no session matches"):
-        places.find_sessions([str(tmp_path / "*")])
 
 
 # Real stages, no data needed

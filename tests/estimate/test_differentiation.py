@@ -189,12 +189,10 @@ class TestUniformGrid:
         grid = uniform_grid(t, RATE)
         assert np.max([np.std(grid.resample(noise, jumps)) for jumps in (False, True)]) < 1.2
 
-    def test_a_command_is_held(self) -> None:
+    def test_a_command_is_held_between_stamps_that_increase(self) -> None:
         t = np.array([0.0, 0.002, 0.0041, 0.008, 0.010])
         held = uniform_grid(t, RATE).hold(np.array([0.0, 1.0, 2.0, 3.0, 4.0]))
         np.testing.assert_array_equal(held, [0.0, 1.0, 1.0, 2.0, 3.0, 4.0])
-
-    def test_stamps_must_increase(self) -> None:
         with pytest.raises(ValueError, match="increase"):
             uniform_grid(np.array([0.0, 0.002, 0.002]), RATE)
 

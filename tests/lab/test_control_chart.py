@@ -33,9 +33,6 @@ def test_the_factors_are_the_quantiles_they_claim_to_be(sessions: int) -> None:
     share = float((distance > find_factor(sessions)).mean())
     # 5400 alarms are expected, and those of one lab come together: 6 % is well over their scatter
     assert share == pytest.approx(FALSE_ALARM, rel=0.06)
-
-
-def test_the_factor_falls_to_three() -> None:
     assert find_factor(10_000) == pytest.approx(3.0, abs=0.002)
 
 

@@ -43,14 +43,6 @@ TRIED = [
     *(pytest.param(c, marks=[pytest.mark.long] * (c in SECOND_PLAY)) for c in CASES),
     *ELSEWHERE,
 ]
-CANONICAL = """
-stribeck presliding asymmetric_coulomb quadratic_drag position_dependent_friction
-load_dependent_friction thermal_damping return_spring inertia_mismatch handle_payload base_tilt
-gravity_compensator_lag gravity_compensator_rate_limit gravity_compensator_mistuned brake_lag
-brake_residual_torque transmission_compliance backlash force_bias force_gain force_crosstalk
-force_delay force_drift force_application_point encoder_scale shear_thinning upper_stop lower_stop
-maxwell_slip unbalance friction_by_pose
-"""
 
 
 def effect_of(case):
@@ -74,10 +66,6 @@ def contribution(case, p_of):
     p = p_of(with_effect)
     changed = residual(with_effect, p, smooth_motion(with_effect))
     return changed - residual(base, p[: len(base.parameters)], smooth_motion(base))
-
-
-def test_every_canonical_name_is_there():
-    assert set(CANONICAL.split()) <= set(registry.effect_names())
 
 
 @pytest.mark.parametrize("name", registry.effect_names())
