@@ -17,6 +17,7 @@ import re
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -411,14 +412,17 @@ def judge(
 
 
 def write_table(outcomes: Sequence[Outcome]) -> str:
-    """Counts by machine and mistake, as Markdown."""
-    lines = ["| machine | mistake | named | beside others alike | by ingest | missed |"]
-    lines.append("|-|-|-|-|-|-|")
+    """Mistakes by machine and outcome, with their number if it is more than one, as Markdown."""
+    lines = ["| machine | named | beside others alike | by ingest | missed |", "|-|-|-|-|-|"]
     spoilt = [o for o in outcomes if o.case.mistake]
-    for machine, mistake in dict.fromkeys((o.case.machine, o.case.mistake) for o in spoilt):
-        some = [o for o in spoilt if (o.case.machine, o.case.mistake) == (machine, mistake)]
-        counts = [sum(o.verdict == v for o in some) for v in ("named", "tied", "read", "missed")]
-        lines.append(f"| {machine} | {mistake} | {' | '.join(str(c or '') for c in counts)} |")
+    for machine in dict.fromkeys(o.case.machine for o in spoilt):
+        cells = []
+        for verdict in ("named", "tied", "read", "missed"):
+            counts = Counter(
+                o.case.mistake for o in spoilt if (o.case.machine, o.verdict) == (machine, verdict)
+            )
+            cells.append(", ".join(f"{m} ({n})" if n > 1 else m for m, n in counts.items()))
+        lines.append(f"| {machine} | {' | '.join(cells)} |")
     if spoilt:
         right = sum(o.verdict != "missed" for o in spoilt)
         beside = sum(o.beside > 0 for o in spoilt)

@@ -11,8 +11,8 @@ STATED = 0.1
 
 def write_rows(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """A table in Markdown."""
-    lines = [head, ["-"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+    lines = ["| " + " | ".join(map(str, line)) + " |" for line in (head, *rows)]
+    return "\n".join([lines[0], "|-" * len(head) + "|", *lines[1:]])
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -76,14 +76,10 @@ def write_kr300(result: Mapping[str, Any]) -> str:
     """Inverse dynamics, simulation and free run by axis."""
     axes = result["axes"]
     rows: list[list[str]] = []
-    for rung in result["choice"]:
-        name = " ".join(f"`{e}`" for e in rung["added"]) or "bare"
-        values = rung["validation_percent"]
-        rows.append([f"{name}, validation, torque, %", *(per_cent(values[a]) for a in axes)])
     rows.append(
-        ["test, torque, %, bare", *(per_cent(result["inverse_percent_bare"][a]) for a in axes)]
+        ["test, torque, %, bare", *(number(result["inverse_percent_bare"][a], 2) for a in axes)]
     )
-    rows.append(["test, torque, %", *(per_cent(result["inverse_percent"][a]) for a in axes)])
+    rows.append(["test, torque, %", *(number(result["inverse_percent"][a], 2) for a in axes)])
     for steps, found in result["simulation"].items():
         rows.append([f"{steps} steps", *(number(x, 2) for x in found["normalised_rmse"])])
         rows.append(
@@ -97,6 +93,8 @@ def write_kr300(result: Mapping[str, Any]) -> str:
     )
     told += f"; its mean is {number(free['mean'])} until then" if left else ""
     note = f" {result['note'].capitalize()}." if result["note"] else ""
+    added = ", ".join(f"`{e}`" for rung in result["choice"] for e in rung["added"])
+    note += f" Chosen by validation, with {added}."
     return f"{write_rows(['', *axes], rows)}\n\nThe free run {told}.{note}"
 
 
