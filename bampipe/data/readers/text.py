@@ -91,7 +91,7 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
     with opened(path) as file:
         stream = _sheet(file) if path.suffix.lower().startswith(".xls") else file
         head = stream.read(HEAD)
-        stream.seek(max(stream.seek(0, io.SEEK_END) - HEAD, 0))
+        stream.seek(max(path.stat().st_size - HEAD, 0))
         tail = stream.read()
         stream.seek(0)
         encoding = dialect.encoding or _encoding(head)
