@@ -140,7 +140,7 @@ def weigh_sets(
                 drops[effect] = _find_evidence_losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
-    excess = _compute_excess(costs)
+    excess = compute_excess(costs)
     sets, unknown = _add_unknown(sets, excess), np.maximum(unknown, excess)
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
     for effect in own if doubtful.any() else ():
@@ -155,7 +155,7 @@ def _sum_squares(residual: Sequence[Array]) -> Array:
     return np.array([max(float(rows @ rows), 1e-300) for rows in residual])
 
 
-def _compute_excess(costs: SetCosts) -> Array:
+def compute_excess(costs: SetCosts) -> Array:
     """Return the probability that the residual of each axis exceeds noise and discrepancy, (n_q,).
 
     With flat prior and N independent samples, log s is normal with variance 1/(2 N).

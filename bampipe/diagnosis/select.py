@@ -9,7 +9,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
-from bampipe.diagnosis.probability import Probabilities, weigh_sets
+from bampipe.diagnosis.probability import Probabilities, compute_excess, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Pool, Search
 from bampipe.diagnosis.session import (
@@ -250,8 +250,7 @@ def _without_weakest(search: Search, given: Collection[str]) -> list[tuple[Key, 
     own = sorted(
         (e for e in p.absence if e not in given), key=lambda e: search.cost(((f"-{e}", ()),))
     )
-    squares = [float(rows @ rows) for rows in search.residual_rows(())]
-    weakest = own if np.any(np.array(squares) > p.count) else own[:1]
+    weakest = own if np.any(compute_excess(search) > 0.5) else own[:1]
     shaped = [e for e in own if p.shapes[e]]
     return [((f"-{e}", ()),) for e in weakest if {*shaped} - {e}]
 

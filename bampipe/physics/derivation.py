@@ -134,12 +134,13 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
     potential = d.build(device.potential, d.base, "energy.potential")
     label = f"device {device.name!r}: energy.kinetic"
     energies = [_Energy(label, device.kinetic, kinetic, potential)] if device.energy else []
-    other, offset = _build_device_torque(d), [sp.S.Zero for _ in d.axes]
+    torque = d.table(device.torque, "torque")
+    d.support, other = [*torque], _add_friction(d, torque)
+    offset = [sp.S.Zero for _ in d.axes]
     measures = any(e.effect.kind == "measurement" for e in acting)
     prompt_force = _find_prompt_forces(d) if measures else []
     # All is in terms of the logged inputs until they are replaced by their acting parts.
     delivered_force, pull = list(inputs.logged), [sp.S.Zero for _ in d.axes]
-    d.support = d.table(device.torque, "torque")
     states = {z: (rate, inputs.initial[z]) for z, rate in inputs.rates.items()}
     for item in acting:
         effect, by_axis = item.effect, offset if item.effect.kind == "measurement" else other
@@ -149,7 +150,7 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
             d.weight = [sp.diff(sum(e.potential for e in energies), q) for q in d.q]
             d.pull = [w - t for w, t in zip(d.weight, pull, strict=True)]
         if effect.uses_inertia:
-            known, torque = _apply_lagrange(d, energies), d.table(device.torque, "torque")
+            known = _apply_lagrange(d, energies)
             d.inertia = [row[i] for i, row in enumerate(known.mass)]
             d.bias = [h - t for h, t in zip(known.bias, torque, strict=True)]
         symbols = d.effect_symbols(
@@ -208,10 +209,9 @@ def _find_prompt_forces(d: Vocabulary) -> list[Any]:
     return [e.subs(zeros) for e in inputs.applied]
 
 
-def _build_device_torque(d: Vocabulary) -> list[Any]:
-    """Q_other of the device without effects: its own torques, friction, brakes."""
-    device = d.model.device
-    other = d.table(device.torque, "torque")
+def _add_friction(d: Vocabulary, torque: Sequence[Any]) -> list[Any]:
+    """Q_other of the device without effects: its own ``torque``, friction, brakes."""
+    device, other = d.model.device, [*torque]
     for i, c in enumerate(device.coordinates):
         sign = d.sgn(d.qd[i])
         if c.name in device.friction:

@@ -286,8 +286,8 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict
     second = _UNITS["s"]
     symbols = _device_symbols(device, _Findings())
     for axis, unit, torque in _axes(device):
-        terms = ("applied", "load", "coulomb", "weight", "pull", "support")
-        symbols |= dict.fromkeys((f"{term}_{axis}" for term in terms), torque)
+        terms = ("applied", "load", "coulomb", "weight", "pull")
+        symbols |= dict.fromkeys((f"{term}_{axis}" for term in (*terms, "support")), torque)
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
