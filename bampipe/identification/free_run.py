@@ -272,7 +272,8 @@ def _run_from_starts(
     motion, p = motions[trial], np.ascontiguousarray(p[: len(system.parameters)])
     u, dt = motion.inputs(system.inputs), float(motion.t[1] - motion.t[0])
     true = motion.of_mechanism(system, u, p)
-    states = np.hstack([true.q, true.qd, system.memory(*true.kinematics, u, p, true.t)])
+    memory = system.memory(*true.kinematics, u, p, true.t)[:, : len(system.memory_names)]
+    states = np.hstack([true.q, true.qd, memory])
     last = len(motion.t) - 1 - round(_MARGIN_S / dt)
     count = int(length / spacing) if spacing > 0.0 else 0
     starts = [round((_MARGIN_S + (number + 0.5) * spacing) / dt) for number in range(count)]

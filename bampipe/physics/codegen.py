@@ -257,7 +257,8 @@ def _print_over_columns(
 
 def _select_groups(e: Equations, names: str) -> dict[str, list[Any]]:
     """Groups of symbols of ``e`` by their names, which spaces separate."""
-    return {name: getattr(e, name) for name in names.split()}
+    groups = e.groups | {"w": e.w}
+    return {name: groups[name] for name in names.split()}
 
 
 def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
@@ -356,7 +357,7 @@ def _print_motion(e: Equations, index: str = "{}", known: Sequence[Any] = ()) ->
     """
     n = len(e.q)
     upper = [(i, j) for i in range(n) for j in range(i, n)]
-    terms = zip(e.applied, e.other, e.noise_force, e.bias, strict=True)
+    terms = zip(e.applied, e.other_now, e.noise_force, e.bias, strict=True)
     force = [a + o + noise - h for a, o, noise, h in terms]
     results = [*_upper_entries(e), *force, *e.rates]
     block = print_block([*results, *e.qd], e.steps, known)

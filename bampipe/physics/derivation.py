@@ -84,6 +84,7 @@ def _assemble_equations(d: Vocabulary) -> Equations:
     kinetic, potential = (sp.Add(*(e[k] for e in terms.energies)) for k in (2, 3))
     return Equations(
         q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=[".".join(key) for key in d.z],
+        changes=d.changes,
         u=[d.channel[c] for c in inputs], inputs=inputs,
         p=list(d.p.values()), w=w, noise=noise,
         steps=motion.steps, mass=motion.mass, bias=motion.bias, dynamics=motion.dynamics,
@@ -153,6 +154,7 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
             known = _apply_lagrange(d, energies)
             d.inertia = [row[i] for i, row in enumerate(known.mass)]
             d.bias = [h - t for h, t in zip(known.bias, torque, strict=True)]
+            d.other = [e - t for e, t in zip(other, torque, strict=True)]
         symbols = d.effect_symbols(
             item, prompt_force if by_axis is offset else delivered_force, inputs.side
         )
@@ -235,7 +237,8 @@ def _check_dependence(
     others = [d.channel[c] for c in device.channels]
     prompt_force = [d.channel[derivative(f, k)] for f in device.forces for k in range(LAST_ORDER)]
     free, u, motion = [*d.p.values(), *d.constants], [*d.channel.values()], [*d.q, *d.qd]
-    all_symbols = [*motion, *u, *free, *d.z.values()]
+    states = [*motion, *u, *free, *d.z.values()]
+    all_symbols = [*states, *d.changes.values()]
     words = "motion, inputs, parameters and internal states"
     rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
     kinetic, potential = ([getattr(e, k) for e in terms.energies] for k in ("kinetic", "potential"))
@@ -247,7 +250,7 @@ def _check_dependence(
     allow("a torque", terms.other, all_symbols, words)
     allow("a process noise", noise_force, [*all_symbols, *w], words)
     allow("the applied force", inputs.applied, all_symbols, words)
-    allow("the rate of an internal state", rates, all_symbols, words)
+    allow("the rate of an internal state", rates, states, words)
     allow("an initial value", initial, [*d.q, *u, *free], "positions, inputs and parameters")
     symbols_allowed = [*d.q, *prompt_force, *others, d.channel["t"], *free]
     allow("an offset", terms.offset, symbols_allowed, "positions, forces and parameters")
@@ -360,7 +363,7 @@ def _find_dependence(
     """
     step_names, numbers = {name for name, _ in steps}, _collect_symbols(v for _, v in steps)
     found = Dependence([], [], [], [], [], [])
-    p, varying = [*d.p.values()], {*d.p.values(), *d.z.values()}
+    p, varying = [*d.p.values()], {*d.p.values(), *d.z.values(), *d.changes.values()}
     inputs, elsewhere = {*d.channel.values()}, _collect_symbols(beside)
     # A term has few of the model's parameters, and sympy is slow to find a slope zero.
     terms = [[(t, t.free_symbols) for t in sp.Add.make_args(e)] for e in residual]

@@ -34,7 +34,8 @@ class Equations:
 
     Attributes:
         q, qd, qdd: coordinates and their rates.
-        z, z_names: internal states of effects.
+        z, z_names: internal states of effects; changes: by state, the symbol of its rate of change
+        along a motion, where a torque depends on that.
         u, inputs: input symbols that the model uses, and their channel names.
         p, w, noise: parameters; additive process noise and its names. steps: named intermediates of
         a robot's bodies, and their values; each may use earlier ones, and everything below may use
@@ -59,6 +60,7 @@ class Equations:
     qdd: list[Any]
     z: list[Any]
     z_names: list[str]
+    changes: dict[Any, Any]
     u: list[Any]
     inputs: list[str]
     p: list[Any]
@@ -81,6 +83,18 @@ class Equations:
     dependence: Dependence
     compensation: list[Any]
     delays: list[str]
+
+    @property
+    def groups(self) -> dict[str, list[Any]]:
+        """Arguments of functions over columns, by name: states are followed by their `changes`."""
+        states = [*self.z, *self.changes.values()]
+        return {"q": self.q, "qd": self.qd, "qdd": self.qdd, "z": states, "u": self.u, "p": self.p}
+
+    @property
+    def other_now(self) -> list[Any]:
+        """``other`` at an instant: the rates of change of the states are those of their equations."""
+        now = {change: self.rates[self.z.index(z)] for z, change in self.changes.items()}
+        return [sp.sympify(e, strict=True).subs(now) for e in self.other]
 
     @property
     def required(self) -> list[Any]:

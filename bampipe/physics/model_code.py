@@ -38,6 +38,7 @@ def effects_code(model: Model) -> Generation:
     brakes = {channels[name] for name in model.device.brakes.values() if name in channels}
     facts = {
         "memory": equations.z_names,
+        "changes": [equations.z.index(z) for z in equations.changes],
         "inputs": equations.inputs,
         "noise": equations.noise,
         "linear": equations.dependence.linear,
@@ -104,7 +105,7 @@ def moved_first(model: Model, e: Equations, forces: list[Any]) -> list[list[int]
             place = e.z_names.index(f"{item.prefix}.{state.name}")
             if (rate := e.rates[place]) in e.z and e.rates[e.z.index(rate)].has(*forces):
                 axis = axes.index(item.axes[0])
-                if e.other[axis].has(e.z[place]):
+                if e.other_now[axis].has(e.z[place]):
                     found[axis] = [2 * n + place, 2 * n + e.z.index(rate)]
     return found
 

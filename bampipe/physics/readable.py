@@ -113,6 +113,7 @@ def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
     for symbols, texts in (
         (e.q, marks), (e.qd, rates), (e.qdd, seconds),
         (e.u, e.inputs), (e.z, e.z_names), (e.p, labels),
+        (e.changes.values(), [f"d {e.z_names[e.z.index(z)]}/dt" for z in e.changes]),
     ):  # fmt: skip
         names |= zip(symbols, texts, strict=True)
     sign = sp.Function("sgn")

@@ -23,12 +23,12 @@ def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
     weights or inertia; ties go by name.
     """
 
-    def order_key(item: BoundEffect) -> tuple[int, bool, str]:
+    def order_key(item: BoundEffect) -> tuple[int, bool, bool, str]:
         link = item.effect.acting_link
         effect = item.effect
         last = "dry" in effect.names or effect.uses_weight or effect.uses_inertia
         last |= effect.uses_support
-        return (_ORDER[link] if link else len(_ORDER), last, item.name)
+        return (_ORDER[link] if link else len(_ORDER), last, effect.ahead is not None, item.name)
 
     return sorted(effects, key=order_key)
 

@@ -29,7 +29,7 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
     """
     constants = {constant_symbol(c): c for c in model.device.constants}
     names = constants | dict(zip(e.p, (p.name for p in model.parameters), strict=True))
-    motion = {*e.q, *e.qd, *e.z, *e.u}
+    motion = {*e.q, *e.qd, *e.z, *e.changes.values(), *e.u}
     factors: list[Any] = []
     # Without motion there is no force. For a robot's bodies, see `base_parameters`.
     for expr in (e.kinetic, e.potential) if model.device.robot is None else ():
@@ -137,5 +137,4 @@ def _print_slopes(model: Model, e: Equations, pivots: Sequence[str]) -> str:
         constant_symbol(name): sp.Float(c.value) for name, c in model.device.constants.items()
     }
     slopes = [sp.diff(r, constant_symbol(n)).subs(numbers) for r in e.residual for n in pivots]
-    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
-    return function_source("slopes", groups, slopes, e.steps)
+    return function_source("slopes", e.groups, slopes, e.steps)

@@ -63,6 +63,7 @@ class System:
         self.coordinate_units = tuple(c.unit for c in axes)
         self.torque_units: tuple[str, ...] = tuple(c.torque_unit for c in axes)
         self.memory_names: tuple[str, ...] = tuple(meta["memory"])
+        self._changes: list[int] = meta["changes"]
         self.states: tuple[str, ...] = (
             *self.coordinates,
             *(f"{c}_rate" for c in self.coordinates),
@@ -398,7 +399,7 @@ class System:
         self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array,
         parts: Sequence[slice] = (slice(None),), known: dict[StateKey, Array] | None = None,
     ) -> Array:  # fmt: skip
-        """Internal states along the motion of one trial, (T, n_z).
+        """Internal states along the motion of one trial, (T, n_z), and rates of change after them.
 
         Integrated by RK4, or by exponential steps where its rate is linear in the state, along
         rates that are cubic between samples and inputs that are linear, in finer steps if a state
@@ -411,7 +412,7 @@ class System:
             parts: rows of each trial, where these are several one after the other.
             known: states along this very motion, of any model; those found are added.
         """
-        out = np.empty((len(q), len(self.memory_names)))
+        out = np.empty((len(q), len(self.memory_names) + len(self._changes)))
         first = [part.start or 0 for part in parts]
         z0 = stack_columns(self._arrays.initial_memory(q[first].T, u[first].T, p), len(first))
         known = {} if known is None else known
@@ -419,11 +420,22 @@ class System:
             module, start = self._state_modules[group.module], z0[:, group.places]
             along = (q, qd, qdd, u, p, t)
             out[:, group.places] = group.integrate(module, along, start, self.inputs, parts, known)
+        for column, place in enumerate(self._changes, len(self.memory_names)):
+            for part in parts:
+                out[part, column] = _differentiate(out[part, place], t[part])
         return out
 
     @cached_property
     def _state_modules(self) -> dict[str, ModuleType]:
         return {group.module: self._code.module(group.module) for group in self.state_groups}
+
+
+def _differentiate(values: Array, t: Array) -> Array:
+    """Rate of change of samples (T,) by central differences of fourth order."""
+    found = np.gradient(values, t)
+    apart = (values[4:] - values[:-4]) / (t[4:] - t[:-4])
+    found[2:-2] = (4.0 * found[2:-2] - apart) / 3.0
+    return found
 
 
 def stack_columns(columns: Sequence[Any], rows: int) -> Array:

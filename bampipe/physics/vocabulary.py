@@ -31,6 +31,7 @@ class Vocabulary:
         q, qd, qdd: their symbols and those of their rates.
         channels: every input there may be; channel: their symbols.
         p, z: symbols of the parameters, and of effects' internal states.
+        changes: of the states whose rate of change an expression asks for, by symbol, its symbol.
         dry: by coordinate, the dry friction that turns with the motion; filled while torques are
             put together, before the first effect that uses it.
         weight: by coordinate, slope of the potential energy; filled like `dry`.
@@ -58,10 +59,11 @@ class Vocabulary:
             for state in item.effect.states:
                 symbol = sp.Symbol(f"z{len(self.z)}", real=True)
                 self.z[item.prefix, state.name] = symbol
+        self.changes: dict[Any, Any] = {}
         self.special = {"sgn": self.sgn, "ddt": self.ddt}
         self.sizes: dict[str, int] = {}
         zeros = [sp.S.Zero] * len(self.axes)
-        self.dry, self.weight, self.pull, self.inertia, self.bias = (zeros for _ in range(5))
+        self.dry, self.weight, self.pull, self.inertia, self.bias, self.other = (zeros for _ in range(6))
         self.support = zeros
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
@@ -142,14 +144,18 @@ class Vocabulary:
         """Total time derivative by the chain rule over motion and measured forces.
 
         Channels that are no forces, such as a supply voltage, count as slow: their rate is zero.
+        That of an internal state gets a symbol of its own, since an impact passes between samples.
         """
         last = [self.channel[derivative(f, LAST_ORDER)] for f in self.model.device.forces]
         if expr.has(*self.qdd, *last):
             raise InputError("ddt() of an acceleration, or of a force's last derivative")
         brakes = [self.channel[b] for b in self.model.device.brakes.values()]
-        if expr.has(*self.z.values(), *brakes):
-            raise InputError("ddt() of an internal state or of a brake command")
-        return self.rate_along(expr, {}).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
+        if expr.has(*brakes, *self.changes.values()):
+            raise InputError("ddt() of a brake command, or twice of an internal state")
+        for k, z in enumerate(self.z.values()):
+            if expr.has(z):
+                self.changes[z] = sp.Symbol(f"dz{k}", real=True)
+        return self.rate_along(expr, self.changes).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
 
     def rate_along(self, expr: Any, further: Mapping[Any, Any]) -> Any:
         """Return the time derivative along the motion, to the last known derivative of a force.
@@ -190,6 +196,7 @@ class Vocabulary:
             symbols |= {n: symbols[f"{n}_{a}"] for n in own}
             symbols |= {"dry": self.dry[i], "qdd": self.qdd[i]}
             symbols |= {"axis_inertia": self.inertia[i], "axis_bias": self.bias[i]}
+            symbols["axis_other"] = self.other[i]
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
         elif item.effect.scope == "axis_pair":
             for letter, axis in zip(PAIR, item.axes, strict=True):

@@ -140,7 +140,7 @@ def steps_to_follow(
     """Mean number of integration steps that a model takes per sample along a motion."""
     u = motion.inputs(system.inputs)
     true = motion.of_mechanism(system, u, p)
-    memory = true.memory(system, p)
+    memory = true.memory(system, p)[:, : len(system.memory_names)]
     rows = slice(None, None, -(-len(u) // probed))
     plant = make_plant(p, len(system.noise), system.sign_widths, longest_step_s)
     x, dt = np.hstack([true.q, true.qd, memory]), float(motion.t[1] - motion.t[0])
