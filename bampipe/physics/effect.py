@@ -273,7 +273,8 @@ class Effect(DeclaredFile):
     @property
     def uses_inertia(self) -> bool:
         """Whether it acts on what the energies require of its axis."""
-        return self.ahead is not None or bool(self.names & {"axis_inertia", "axis_bias"})
+        of_axis = {"axis_inertia", "axis_bias", "axis_torque"}
+        return self.ahead is not None or bool(self.names & of_axis)
 
     @property
     def pulls(self) -> bool:

@@ -92,7 +92,7 @@ class Equations:
 
     @property
     def other_now(self) -> list[Any]:
-        """``other`` at an instant: the rates of change of the states are those of their equations."""
+        """``other`` at an instant, with the rates of change of the states from their equations."""
         now = {change: self.rates[self.z.index(z)] for z, change in self.changes.items()}
         return [sp.sympify(e, strict=True).subs(now) for e in self.other]
 

@@ -63,7 +63,7 @@ class System:
         self.coordinate_units = tuple(c.unit for c in axes)
         self.torque_units: tuple[str, ...] = tuple(c.torque_unit for c in axes)
         self.memory_names: tuple[str, ...] = tuple(meta["memory"])
-        self._changes: list[int] = meta["changes"]
+        self.changes: tuple[int, ...] = tuple(meta["changes"])
         self.states: tuple[str, ...] = (
             *self.coordinates,
             *(f"{c}_rate" for c in self.coordinates),
@@ -412,7 +412,7 @@ class System:
             parts: rows of each trial, where these are several one after the other.
             known: states along this very motion, of any model; those found are added.
         """
-        out = np.empty((len(q), len(self.memory_names) + len(self._changes)))
+        out = np.empty((len(q), len(self.memory_names) + len(self.changes)))
         first = [part.start or 0 for part in parts]
         z0 = stack_columns(self._arrays.initial_memory(q[first].T, u[first].T, p), len(first))
         known = {} if known is None else known
@@ -420,7 +420,7 @@ class System:
             module, start = self._state_modules[group.module], z0[:, group.places]
             along = (q, qd, qdd, u, p, t)
             out[:, group.places] = group.integrate(module, along, start, self.inputs, parts, known)
-        for column, place in enumerate(self._changes, len(self.memory_names)):
+        for column, place in enumerate(self.changes, len(self.memory_names)):
             for part in parts:
                 out[part, column] = _differentiate(out[part, place], t[part])
         return out

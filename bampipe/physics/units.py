@@ -291,7 +291,7 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
-            symbols |= dict.fromkeys((*terms, "dry", "axis_bias", "axis_other"), torque)
+            symbols |= dict.fromkeys((*terms, "dry", "axis_bias", "axis_torque"), torque)
             symbols |= {"qdd": unit / second**2, "axis_inertia": torque * second**2 / unit}
             symbols["viscous"] = torque * second / unit
             if axis in device.side_load:

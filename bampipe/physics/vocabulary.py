@@ -38,7 +38,8 @@ class Vocabulary:
         pull: by coordinate, the same less the torque of springs and the like; filled like `dry`.
         inertia: by coordinate, its entry on the diagonal of the mass matrix; filled like `dry`.
         bias: by coordinate, the energies' terms without acceleration, less the device's own
-            torques; filled like `dry`. base: names that every expression of the device may use.
+            torques; torque: all torques beside those; filled like `dry`.
+        base: names that every expression of the device may use.
     """
 
     def __init__(self, model: Model, named_constants: bool = False) -> None:
@@ -63,8 +64,8 @@ class Vocabulary:
         self.special = {"sgn": self.sgn, "ddt": self.ddt}
         self.sizes: dict[str, int] = {}
         zeros = [sp.S.Zero] * len(self.axes)
-        self.dry, self.weight, self.pull, self.inertia, self.bias, self.other = (zeros for _ in range(6))
-        self.support = zeros
+        self.dry, self.weight, self.pull, self.inertia, self.bias = (zeros for _ in range(5))
+        self.support = self.torque = zeros
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.constants = [constant_symbol(name) for name in device.constants if named_constants]
@@ -196,7 +197,7 @@ class Vocabulary:
             symbols |= {n: symbols[f"{n}_{a}"] for n in own}
             symbols |= {"dry": self.dry[i], "qdd": self.qdd[i]}
             symbols |= {"axis_inertia": self.inertia[i], "axis_bias": self.bias[i]}
-            symbols["axis_other"] = self.other[i]
+            symbols["axis_torque"] = self.torque[i]
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
         elif item.effect.scope == "axis_pair":
             for letter, axis in zip(PAIR, item.axes, strict=True):

@@ -98,9 +98,9 @@ def random_inputs(system, count, seed):
 
 
 def memory_within_reason(system, count, seed):
-    """Internal states of ordinary size, (count, n_z)."""
+    """Internal states of ordinary size, and rates of change, (count, n_z + n_changes)."""
     rng = np.random.default_rng(seed)
-    return rng.uniform(0.05, 0.9, size=(count, len(system.memory_names)))
+    return rng.uniform(0.05, 0.9, size=(count, len(system.memory_names + system.changes)))
 
 
 def declaration(name="bam"):

@@ -65,7 +65,7 @@ def numbers(equations, model):
         at[symbol] = p.prior if p.typical is None else p.typical
     states = {n: rng.uniform(0.2, 0.4) for n in sorted(equations.z_names)}
     at |= {z: states[n] for z, n in zip(equations.z, equations.z_names, strict=True)}
-    groups = [equations.applied, equations.other, equations.bias, equations.offset,
+    groups = [equations.applied, equations.other_now, equations.bias, equations.offset,
               equations.offset_rate]  # fmt: skip
     rates = dict(zip(equations.z_names, equations.rates, strict=True))
     expressions = [*(e for group in groups for e in group), *(rates[n] for n in sorted(rates))]
@@ -282,7 +282,7 @@ BALANCED = 3.56 * 9.81 * (Q[:, 2] - 0.461) * np.cos(Q[:, 1])
 
 def torque(system: System, values: dict[str, float], z: np.ndarray | None = None) -> np.ndarray:
     p = with_values(system, values)
-    z = np.zeros((2, len(system.memory_names))) if z is None else z
+    z = np.zeros((2, len(system.memory_names + system.changes))) if z is None else z
     return system.compensation(Q, QD, z, np.zeros((2, len(system.inputs))), p)
 
 

@@ -92,7 +92,10 @@ def test_finite_everywhere(case):
     n, rng = 400, np.random.default_rng(7)
     q, qd, qdd = random_motion(system.model.device, n, 7, speed=3.0)
     qdd *= 10.0
-    u, z = random_inputs(system, n, 8), rng.normal(size=(n, len(system.memory_names)))
+    u, z = (
+        random_inputs(system, n, 8),
+        rng.normal(size=(n, len(system.memory_names + system.changes))),
+    )
     u *= rng.choice([1.0, 10.0, 1e3], n)[:, None]
     for rows in (slice(0, 40), slice(20, 80)):  # standstill, and no load
         qd[rows] = 0.0

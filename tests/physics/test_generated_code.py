@@ -97,9 +97,10 @@ def test_columns_and_functions_of_one_state_agree(device, effects):
     added = system.contribution(q, qd, qdd, z, u, p)
     np.testing.assert_allclose(without + added, columns, atol=1e-12 * scale)
 
-    x, w = np.hstack([q, qd, z]), np.zeros((count, len(system.noise)))
+    states = len(system.memory_names)
+    x, w = np.hstack([q, qd, z[:, :states]]), np.zeros((count, len(system.noise)))
     rates, _ = rates_and_readings(printed, system, x, u, [p] * count, w)
-    bends = rates[:, n : 2 * n]
+    bends, z[:, states:] = rates[:, n : 2 * n], rates[:, [2 * n + k for k in system.changes]]
     inertia = np.abs(np.einsum("tij,tj->ti", system.mass_matrix(q, p), bends)).max()
     again = residual(q, qd, bends, z, u)
     np.testing.assert_allclose(again, 0.0, atol=1e-12 * max(scale, inertia))

@@ -153,7 +153,7 @@ def test_behind_play_the_arm_moves_apart_from_the_drive_that_its_encoder_sees():
         behind = bare.mass_matrix(q[None], p)[0, 1, 1] - own["drive_inertia"]
         pressed = behind * (50.0**2 * (lead - 0.01) + 2 * 0.8 * 50.0 * (rate - qd[1]))
         friction = p[system.index("viscous.pitch")] * qd[1] + p[system.index("coulomb.pitch")]
-        found = derivative(system, np.concatenate([q, qd, [q[1] + lead, rate]]), p)
+        found = derivative(system, np.concatenate([q, qd, [q[1] + lead, rate, q[1], qd[1]]]), p)
         # Only the contact and its own friction accelerate what the encoder sees.
         carried = [(pressed * (lead > 0.01) - friction) / own["drive_inertia"], rate]
         assert found[[4, 6]] == pytest.approx(carried, rel=1e-2)

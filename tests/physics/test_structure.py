@@ -99,7 +99,7 @@ def test_slopes_equal_differences(machine: Device, effects: tuple[str, ...]) -> 
     q, qd, qdd = 0.5 * rng.normal(size=(3, SAMPLES, n))
     u, p = rng.normal(size=(SAMPLES, len(system.inputs))), system.prior
     motion = q, qd, qdd
-    z = rng.normal(size=(SAMPLES, len(system.memory_names)))
+    z = rng.normal(size=(SAMPLES, len(system.memory_names + system.changes)))
     wanted = sorted(system.lasting)
 
     found = system.slopes(wanted, *motion, u)
