@@ -65,7 +65,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     device = session_device(session)
     if device.drive:
         # A command to a motor may be constant or at its limit for long, and motors hold axes.
-        config = replace(config, frozen_share=1.0, saturated_share=1.0)
+        config = replace(config, frozen_share=1.0, saturated_share=1.0, held_axes=True)
     (out / "ingest").mkdir(parents=True, exist_ok=True)
     channels = ChannelRecords(session, device)
     every = thinning_factor(session.sample_rate, config.fastest_hz)

@@ -175,7 +175,7 @@ def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> No
         for encoder in session.encoders:
             if travel[encoder.name] == 0.0:
                 said, remedy = "never changes while other axes move", "check the encoder's cable"
-                if limits.frozen_share < 1.0:
+                if not limits.held_axes:
                     raise table.fault(f"{said}: frozen", column=encoder.column, remedy=remedy)
                 table.notes.append(f"column '{encoder.column}' {said}: is {encoder.name} held?")
         return

@@ -35,7 +35,8 @@ class CleaningLimits:
         nan_share: largest share of missing samples in a channel.
         saturated_share: largest share of samples of a locked trial at the rail of a force channel;
             of others, what is read at a rail is left out.
-        frozen_share: largest share of the trial that a force channel may stand still; 1: axes, too.
+        frozen_share: largest share of the trial that a force channel may stand still.
+        held_axes: an axis may stand still while others move, as motors can hold it.
         still_rad, still_m: a free trial moves more than this, rad or m, on some axis.
         locked_rad, locked_m: a locked axis moves less than this, rad or m.
         locked_steps: a locked axis deflects by at least this many encoder steps.
@@ -50,6 +51,7 @@ class CleaningLimits:
     nan_share: NotNegative = 0.01
     saturated_share: NotNegative = 0.01
     frozen_share: NotNegative = 0.2
+    held_axes: bool = False
     still_rad: NotNegative = 0.005
     still_m: NotNegative = 0.0005
     locked_rad: NotNegative = 0.2
