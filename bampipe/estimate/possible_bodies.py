@@ -50,7 +50,12 @@ def is_possible(numbers: Array) -> bool:
 
 
 def nearest_possible(
-    value: Array, weight: Array, bodies: Indices, start: Array, bounds: tuple[Array, Array]
+    value: Array,
+    weight: Array,
+    prior_sd: Array,
+    bodies: Indices,
+    start: Array,
+    bounds: tuple[Array, Array],
 ) -> Array:
     """Return the possible numbers that are nearest to an estimate, (n,).
 
@@ -60,12 +65,13 @@ def nearest_possible(
 
     Args:
         value: (n,), the estimate; weight: (n, n), such as the inverse of its covariance.
+        prior_sd: (n,), distances over which the numbers may leave the estimate if the weight does
+            not determine them; infinite for those that it does.
         bodies: (bodies, 10) indices of the numbers of each body.
         start: (bodies, 10), starting values, possible or not, such as those of a drawing.
         bounds: lower and upper bounds, (n,) each, of the other parameters.
     """
-    size = np.diag(weight)
-    weight = weight + np.diag(np.where(size > 0.0, _ANCHOR * size, 1.0))
+    weight = weight + np.diag(_ANCHOR * np.diag(weight) + prior_sd**-2.0)
     sd = 1.0 / np.sqrt(np.diag(weight))
     others = np.setdiff1d(np.arange(value.size), bodies)
     low, high = (each[others] for each in bounds)

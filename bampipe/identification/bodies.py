@@ -53,20 +53,21 @@ def _find_nearest(system: System, squares: SquaresFit, places: Array, nominal: A
     ``places`` and the drawing's numbers, ``nominal``, are (b, 10).
     """
     count, unseen = squares.free.size, np.setdiff1d(places, squares.free)
-    # The drawing determines the combinations that no motion shows.
-    of_drawing = [system.parameters[k].sd ** -2.0 for k in unseen]
-    weight = block_diag(squares.information, np.diag(of_drawing))
-    # Friction and drives that no motion shows stay where the fit left them.
-    for row, k in enumerate(squares.free[squares.free < len(system.parameters)]):
-        item = system.parameters[k]
-        weight[row, row] += 0.0 if item.weighed or not item.sd else item.sd**-2.0
+    weight = block_diag(squares.information, np.zeros((unseen.size, unseen.size)))
     at = np.full(len(weight), -1)  # without the nuisance parameters
     at[:count], at[len(at) - unseen.size :] = squares.free, unseen
     value, low, high = np.zeros(len(at)), np.full(len(at), -np.inf), np.full(len(at), np.inf)
     value[at >= 0] = squares.p[at[at >= 0]]
     low[:count], high[:count] = squares.problem.lower, squares.problem.upper
+    # The drawing determines the bodies that no motion shows; friction and drives that none shows
+    # stay where the fit left them.
+    prior_sd = np.full(len(at), np.inf)
+    for row, k in enumerate(at):
+        if 0 <= k < len(system.parameters) and not (row < count and system.parameters[k].weighed):
+            prior_sd[row] = system.parameters[k].sd or np.inf
     bodies = np.array([[int(np.flatnonzero(at == place)[0]) for place in b] for b in places])
-    found, p = nearest_possible(value, weight, bodies, nominal, (low, high)), squares.p.copy()
+    found = nearest_possible(value, weight, prior_sd, bodies, nominal, (low, high))
+    p = squares.p.copy()
     p[at[at >= 0]] = found[at >= 0]
     return p
 

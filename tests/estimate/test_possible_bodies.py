@@ -30,7 +30,7 @@ def test_point_masses_are_possible_and_their_own_nearest() -> None:
     assert not is_possible(one)
     value, start = bodies(2), bodies(2)
     weight = np.diag(RNG.uniform(1.0, 10.0, 20))
-    found = nearest_possible(value.ravel(), weight, PLACES, start, (-EVERY, EVERY))
+    found = nearest_possible(value.ravel(), weight, EVERY, PLACES, start, (-EVERY, EVERY))
     np.testing.assert_allclose(found, value.ravel(), atol=1e-4)
 
 
@@ -41,9 +41,15 @@ def test_the_nearest_is_possible_and_no_other_is_nearer() -> None:
     root = RNG.normal(size=(22, 22))
     weight = root @ root.T + np.eye(22)
     low, high = -np.append(EVERY, [0.0, np.inf]), np.append(EVERY, [3.0, np.inf])
-    found = nearest_possible(value, weight, PLACES, truth, (low, high))
+    found = nearest_possible(value, weight, high + np.inf, PLACES, truth, (low, high))
     assert all(is_possible(numbers) for numbers in found[PLACES])
     assert found[20] >= 0.0
+    # A number of which the weight says nothing stays, in whatever unit.
+    places, prior_sd = np.ix_(range(21), range(21)), np.append(np.full(21, np.inf), 1e-6)
+    known = np.zeros((22, 22))
+    known[places] = weight[places]
+    left = nearest_possible(value, known, prior_sd, PLACES, truth, (low, high))
+    assert left[21] == value[21]
 
     def distance(numbers: np.ndarray) -> float:
         return float((numbers - value) @ weight @ (numbers - value))
@@ -63,4 +69,5 @@ def test_a_point_mass_that_was_fitted_to_nearly_noise_free_trials_has_a_nearest_
         value = start + RNG.normal(size=10) * mass * 10.0 ** RNG.uniform(-3.0, 1.0)
         weight = np.diag(10.0 ** RNG.uniform(-4.0, 8.0, 10))
         bounds = -EVERY[:10], EVERY[:10]
-        assert is_possible(nearest_possible(value, weight, PLACES[:1], start[None], bounds))
+        found = nearest_possible(value, weight, EVERY[:10], PLACES[:1], start[None], bounds)
+        assert is_possible(found)
