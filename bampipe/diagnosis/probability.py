@@ -143,9 +143,9 @@ def weigh_sets(
     excess = compute_excess(costs)
     sets, unknown = _add_unknown(sets, excess), np.maximum(unknown, excess)
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
-    for effect in own if doubtful.any() else ():
+    shares = _find_shares(costs, own, functions, doubtful) if doubtful.any() else {}
+    for effect, share in shares.items():
         # A doubtful effect is not absent: the model keeps it, and the report mentions it.
-        share = _share_explained(costs, effect, functions, doubtful)
         effects[effect] = min(effects[effect], max(share, 1.0 - criteria.probability))
     return Probabilities(sets, effects, if_all_known, unknown, tuple(functions), drops)
 
@@ -183,24 +183,26 @@ def _add_unknown(sets: Sequence[SetEvidence], excess: Array) -> tuple[SetEvidenc
     return tuple(sorted([*rest, *beside.values()], key=lambda s: -s.probability))
 
 
-def _share_explained(
-    costs: SetCosts, effect: str, functions: Sequence[Unknown | None], far: Flags
-) -> float:
-    """Return the largest share of the error without an effect that it explains on ``far`` axes.
+def _find_shares(
+    costs: SetCosts, effects: Sequence[str], functions: Sequence[Unknown | None], far: Flags
+) -> dict[str, float]:
+    """Return the largest share of the error without each effect that it explains on ``far`` axes.
 
     Something unknown there may resemble an effect that leaves a large error. The noise, which the
     unknown function leaves, is not part of it. The share is 1 if the other axes support the effect
     by `_MARGIN`, or more than these.
     """
-    p = costs.problem
-    now, without = (_sum_squares(costs.residual_rows(k)) for k in ((), ((f"-{effect}", ()),)))
-    gain = 0.5 * p.independent * np.log(without / now)
-    if gain[~far].sum() >= min(gain[far].sum(), _MARGIN):
-        return 1.0
+    p, now = costs.problem, _sum_squares(costs.residual_rows(()))
     rest = [now if f is None else _sum_squares(f.residual) for f in functions]
     noise = np.minimum(np.diag(rest), np.minimum(p.count, now))
-    ratio = (now - noise)[far] / np.maximum(without - noise, 1e-300)[far]
-    return float(np.max(1.0 - np.sqrt(np.maximum(ratio, 0.0))))
+    shares = {}
+    for effect in effects:
+        without = _sum_squares(costs.residual_rows(((f"-{effect}", ()),)))
+        gain = 0.5 * p.independent * np.log(without / now)
+        ratio = (now - noise)[far] / np.maximum(without - noise, 1e-300)[far]
+        by_others = gain[~far].sum() >= min(gain[far].sum(), _MARGIN)
+        shares[effect] = 1.0 if by_others else float(1.0 - np.sqrt(np.maximum(ratio.min(), 0.0)))
+    return shares
 
 
 def _compute_probabilities(listed: Sequence[SetEvidence], seed: int) -> tuple[SetEvidence, ...]:

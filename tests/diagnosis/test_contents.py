@@ -10,7 +10,7 @@ from sessions import AXIS, KINEMATICS, SENSORS, fit_trials, made
 
 from bampipe.diagnosis.candidates import build_candidate_model, compile_candidate
 from bampipe.diagnosis.dictionary import Dictionary
-from bampipe.diagnosis.probability import _share_explained
+from bampipe.diagnosis.probability import _find_shares
 from bampipe.diagnosis.session import candidates_of
 from bampipe.diagnosis.shape import _size, worst_windows
 from bampipe.physics import registry
@@ -118,8 +118,8 @@ def test_what_only_an_axis_far_above_the_noise_shows_is_as_sure_as_its_share(wit
         residual_rows=lambda keys: [np.full(50, level) for level in rows[keys]],
     )
     unknown = SimpleNamespace(residual=(np.full(50, 10.0), np.ones(50)))
-    found = _share_explained(search, "stribeck:yaw", (unknown, None), np.array([True, False]))
-    assert found == pytest.approx(share)
+    found = _find_shares(search, ["stribeck:yaw"], (unknown, None), np.array([True, False]))
+    assert found == {"stribeck:yaw": pytest.approx(share)}
 
 
 @pytest.mark.parametrize("name", ["loose_load:carriage", "loose_drive:carriage"])
