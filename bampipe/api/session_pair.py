@@ -119,27 +119,7 @@ def compare_runs(
         progress(0.3, f"looking for effects that the model of {one.name} lacks on {other.name}")
         journeys.append(_describe_journey(one, other, linearisation))
     progress(0.9, "comparing the residuals by state")
-    tables: list[dict[str, ParameterEstimate | BaseEstimate]] = []
-    for found in (a.found, b.found):
-        own = {n: entry for n, entry in found.parameters.items() if n not in found.inertial}
-        shown = {base.combination: base for base in found.base_parameters or () if base.shown}
-        tables.append({**own, **shown})
-    common = [name for name in tables[0] if name in tables[1]]
-    pairs = {name: (tables[0][name], tables[1][name]) for name in common}
-    z = []
-    for x, y in pairs.values():
-        sd = math.hypot(x.sd, y.sd)
-        z.append((y.estimate - x.estimate) / sd if sd else 0.0)
-    p_values = correct_p_values(z)
-    parameters = {
-        name: ParameterChange(
-            first=x.estimate, first_sd=x.sd, second=y.estimate, second_sd=y.sd, unit=x.unit,
-            standard_errors=ratio, p_value=p, changed=p < FAMILY_ERROR,
-        )
-        for (name, (x, y)), ratio, p in zip(pairs.items(), z, p_values, strict=True)
-    }  # fmt: skip
-    sides = zip((a, b), tables, strict=True)
-    alone = {side.name: [n for n in some if n not in common] for side, some in sides}
+    parameters, alone = _compare_parameters(a, b)
     notes += [f"Only {name} has {join_names(some)}." for name, some in alone.items() if some]
     pair = PairResult(
         device=a.system.model.device.name,
@@ -186,6 +166,33 @@ def _list_facts(system: System) -> dict[str, set[str]]:
         "axes": {*system.coordinates},
         "parameters": {f"{q.name} ({q.unit})" for q in own},
     }
+
+
+def _compare_parameters(
+    a: _Side, b: _Side
+) -> tuple[dict[str, ParameterChange], dict[str, list[str]]]:
+    """Return the changes of common parameters, and the other parameters of each session."""
+    tables: list[dict[str, ParameterEstimate | BaseEstimate]] = []
+    for found in (a.found, b.found):
+        own = {n: entry for n, entry in found.parameters.items() if n not in found.inertial}
+        shown = {base.combination: base for base in found.base_parameters or () if base.shown}
+        tables.append({**own, **shown})
+    common = [name for name in tables[0] if name in tables[1]]
+    pairs = {name: (tables[0][name], tables[1][name]) for name in common}
+    z = []
+    for x, y in pairs.values():
+        sd = math.hypot(x.sd, y.sd)
+        z.append((y.estimate - x.estimate) / sd if sd else 0.0)
+    p_values = correct_p_values(z)
+    changes = {
+        name: ParameterChange(
+            first=x.estimate, first_sd=x.sd, second=y.estimate, second_sd=y.sd, unit=x.unit,
+            standard_errors=ratio, p_value=p, changed=p < FAMILY_ERROR,
+        )
+        for (name, (x, y)), ratio, p in zip(pairs.items(), z, p_values, strict=True)
+    }  # fmt: skip
+    sides = zip((a, b), tables, strict=True)
+    return changes, {side.name: [n for n in some if n not in common] for side, some in sides}
 
 
 def correct_p_values(z: Sequence[float]) -> list[float]:

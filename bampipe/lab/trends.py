@@ -134,8 +134,22 @@ def _explain_shift(
         if judged.diagnosed:
             return DEVICE, f"{moved}; its diagnosis finds nothing missing: the device changed", ""
         return UNKNOWN, f"{moved}; no diagnosis has been made", _diagnose_command(judged)
-    # With a model that has the effect, its estimates decide; without one, the effect accounts
-    # neither for a parameter of an axis on which nothing is missing, nor for a stiffness.
+    back, still = _split_moved(judged, outside, mine)
+    sentence = phrases.describe_shift(moved, lacking, back, still)
+    remedy = "" if back or still else f"bampipe extend {judged.session} --auto, then bampipe lab"
+    return BOTH if still else EFFECT, sentence, remedy
+
+
+def _split_moved(
+    judged: SessionVerdict,
+    outside: Mapping[ControlChart, ChartPoint],
+    mine: Mapping[str, Sequence[TableRow]],
+) -> tuple[list[str], list[str]]:
+    """Return the parameters for which the missing effect accounts, and those beyond it.
+
+    With a model that has the effect, its estimates decide; without one, the effect accounts neither
+    for a parameter of an axis on which nothing is missing, nor for a stiffness.
+    """
     models = {r["model"] for r in mine["parameters"]} - {BASE}
     largest = max(models, key=lambda name: (name.count("+"), name), default="")
     chosen = judged.model if judged.model != BASE else largest
@@ -153,9 +167,7 @@ def _explain_shift(
             (back if inside else still).append(chart.name)
         elif chart.name.startswith("stiffness.") or chart.name.rpartition(".")[2] in clean:
             still.append(chart.name)
-    sentence = phrases.describe_shift(moved, lacking, back, still)
-    remedy = "" if back or still else f"bampipe extend {judged.session} --auto, then bampipe lab"
-    return BOTH if still else EFFECT, sentence, remedy
+    return back, still
 
 
 def _diagnose_command(judged: SessionVerdict) -> str:

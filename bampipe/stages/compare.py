@@ -1,7 +1,7 @@
 """Stage compare: the ladder of model versions on the same held-out trials."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pydantic.dataclasses import dataclass as checked_dataclass
@@ -57,7 +57,19 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         for key, found in run.read(IdentifyResult, name).parameters.items():
             parameters.setdefault(key, {})[name] = Value.of(found)
     confirmed = [name for name in order if ladder[name].confirmed]
-    # Parameters that a confirmed model changed by more than their uncertainty.
+    moved = _find_moved(parameters, models, confirmed, config.sigmas)
+    return CompareResult(
+        best=best, ladder=tuple(ladder.values()), parameters=parameters, moved=moved
+    ).write(out)
+
+
+def _find_moved(
+    parameters: Mapping[str, Mapping[str, Value]],
+    models: Mapping[str, ModelFile],
+    confirmed: Sequence[str],
+    sigmas: float,
+) -> tuple[Moved, ...]:
+    """Return the parameters that a confirmed model changed by more than their uncertainty."""
     moved = []
     for model in confirmed:
         parent = models[model].parent
@@ -66,7 +78,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
                 continue
             old, new = by_model[parent], by_model[model]
             sd, change = math.hypot(old.sd, new.sd), new.estimate - old.estimate
-            if abs(change) > config.sigmas * sd:
+            if abs(change) > sigmas * sd:
                 sentence = (
                     f"{name} moved from {round_with_sd(old.estimate, old.sd)} to"
                     f" {round_with_sd(new.estimate, new.sd)} {new.unit}: without the effect it"
@@ -74,9 +86,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
                 )
                 of_model = {"parameter": name, "model": model, "parent": parent}
                 moved.append(Moved.of(new, **of_model, change=change, sd=sd, sentence=sentence))
-    return CompareResult(
-        best=best, ladder=tuple(ladder.values()), parameters=parameters, moved=tuple(moved)
-    ).write(out)
+    return tuple(moved)
 
 
 def _rung(

@@ -47,7 +47,7 @@ from bampipe.progress import Progress
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.next import Detectable, Extent, NextResult, Purpose, Trajectory
+from bampipe.results.next import Detectable, Extent, NextResult, Plan, Proposal, Purpose, Trajectory
 from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block
@@ -141,23 +141,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         result = _write_trajectory(out, case, forecast.rehearsal, ranked[0], result)
     if config.plan:
         progress(0.92, "planning a set of trials")
-        precision, known = forecast.precision, case.identified.parameters
-        estimates = np.array([known[name].estimate for name in precision.names])
-        # For a model that lacks something, the plan has no goal for uncertainties.
-        is_asked = (forecast.comparison is None) & (estimates != 0.0)
-        goal = Goal(np.where(is_asked, config.sd * np.abs(estimates), np.inf), config.confusion)
-        # Parameters that the best design for all leaves too uncertain get designs of their own.
-        asked = dict(zip(precision.names, goal.sd, strict=True))
-        utilities = [
-            partial(precision.utility, seconds=config.seconds, parameter=name)
-            for name, sd in result.proposals[0].sd.items()
-            if sd.after > asked[name]
-        ]
-        options = list(ranked)
-        if utilities:
-            fitted = replace(space, with_rests=False)
-            options += find_best_of_each(fitted, precision.of_motion, utilities)
-        plan = record_plan(forecast, goal, plan_trials(forecast, options, goal))
+        plan = _plan_trials(case, forecast, space, ranked, result.proposals[0])
         result = result.model_copy(update={"plan": plan})
     result.write(out)
     # Earlier proposals whose trial may still come, each named by its content.
@@ -325,6 +309,33 @@ def _record(
     lacking = [axis for axis, entry in axes if entry.standing == "above_floor"]
     why, expected = explain_proposal(result, unlimited, lacking, missing, unbraked)
     return result.model_copy(update={"why": why, "expected": expected})
+
+
+def _plan_trials(
+    case: _Case,
+    forecast: Forecast,
+    space: DesignSpace,
+    ranked: Sequence[RankedDesign],
+    best: Proposal,
+) -> Plan:
+    """Return a set of trials that reaches the goal, chosen among ``ranked`` and further designs."""
+    precision, config = forecast.precision, case.config
+    estimates = np.array([case.identified.parameters[name].estimate for name in precision.names])
+    # For a model that lacks something, the plan has no goal for uncertainties.
+    is_asked = (forecast.comparison is None) & (estimates != 0.0)
+    goal = Goal(np.where(is_asked, config.sd * np.abs(estimates), np.inf), config.confusion)
+    # Parameters that the best design for all leaves too uncertain get designs of their own.
+    asked = dict(zip(precision.names, goal.sd, strict=True))
+    utilities = [
+        partial(precision.utility, seconds=config.seconds, parameter=name)
+        for name, sd in best.sd.items()
+        if sd.after > asked[name]
+    ]
+    options = list(ranked)
+    if utilities:
+        fitted = replace(space, with_rests=False)
+        options += find_best_of_each(fitted, precision.of_motion, utilities)
+    return record_plan(forecast, goal, plan_trials(forecast, options, goal))
 
 
 def _write_trajectory(

@@ -231,14 +231,24 @@ def _loops_of(
     channels = {name: held[name] for name in system.inputs}
     motion = Motion(trial_id, grid.t, q, still, still, still, channels)
     signals = Signals.of_session(system, session)
-    # The share of the stiffness that one standard uncertainty of each source is.
-    calibration = {}
+    calibration = _find_calibration_shares(system, signals, motion, number, torque)
+    return _Loops(trial_id, pose, torque, deflection, rate, found, calibration)
+
+
+def _find_calibration_shares(
+    system: System, signals: Signals, motion: Motion, number: int, torque: Array
+) -> dict[str, float]:
+    """Return the share of a stiffness that one standard uncertainty of each source is.
+
+    ``torque`` (T,) is that on axis ``number``, as logged.
+    """
+    deflection, shares = motion.q[:, number], {}
     for name, change in calibration_changes(signals):
         moved = change.of_motion(motion, signals)
         theirs = _applied(system, moved.q, moved.inputs(system.inputs), moved.t)[:, number]
         torques, deflections = _slope(theirs, torque), _slope(moved.q[:, number], deflection)
-        calibration[name] = torques / deflections - 1.0
-    return _Loops(trial_id, pose, torque, deflection, rate, found, calibration)
+        shares[name] = torques / deflections - 1.0
+    return shares
 
 
 def _applied(system: System, q: Array, u: Array, t: Array) -> Array:
