@@ -84,7 +84,6 @@ def run(
 
     Example: bampipe run 'sessions/*' --jobs 2 --junit gates.xml
     """
-    from bampipe.cli.next_step import after_run, print_forecasts
     from bampipe.run import batch
     from bampipe.run import pipeline as pipelines
     from bampipe.run.request import Request
@@ -110,29 +109,36 @@ def run(
         processes=batch.share(at_once),
         wait=not no_wait,
     )
-    requests, outcomes = _make_requests(common, folders)
+    requests, refused = _make_requests(common, folders)
     several = len(folders) > 1
     with show.Watcher(quiet, several) as watcher:
         if engine == "dask":
             from bampipe.run.cluster import run_on_cluster
 
-            outcomes += run_on_cluster(requests, scheduler, watcher)
+            outcomes = run_on_cluster(requests, scheduler, watcher)
         elif several:
-            outcomes += batch.run_sessions(requests, jobs, watcher)
+            outcomes = batch.run_sessions(requests, jobs, watcher)
         else:
-            outcomes.append(batch.run_and_publish(requests[0], watcher))
+            outcomes = [batch.run_and_publish(requests[0], watcher)]
+    outcomes = [*refused, *outcomes]
     _write_summaries(outcomes, junit, markdown)
     _report_runs(outcomes, several, json)
     refresh(runs, several, quiet or json)
     if not several:
-        root, chosen = outcomes[0].root, outcomes[0].model
-        if not json:
-            print_forecasts(root, chosen)
-        command = after_run(root, chosen).replace("RUN", places.next_to(requests[0].root, runs))
-        show.print_advice(command, quiet, json)
+        _advise(outcomes[0], runs, quiet, json)
     code = max(outcome.exit_code for outcome in outcomes)
     if code:
         raise typer.Exit(code)
+
+
+def _advise(outcome: Outcome, runs: Path, quiet: bool, json: bool) -> None:
+    """Print what came of earlier proposals, and the next command."""
+    from bampipe.cli.next_step import after_run, print_forecasts
+
+    if not json:
+        print_forecasts(outcome.root, outcome.model)
+    command = after_run(outcome.root, outcome.model)
+    show.print_advice(command.replace("RUN", places.next_to(outcome.root, runs)), quiet, json)
 
 
 def _make_requests(common: Request, folders: Sequence[Path]) -> tuple[list[Request], list[Outcome]]:

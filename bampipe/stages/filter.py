@@ -137,26 +137,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     records, refused = _tuning_records(samples, ids, tuple(axes), rate, config.tuning_samples)
     if not any(records.values()):
         raise _nothing_to_differentiate(run, trials, refused)
-    filters: dict[str, AxisFilter] = {}
-    about: dict[str, dict[str, Any]] = {}
-    for axis, entry in axes.items():
-        filters[axis], about[axis] = _choose(axis, records[axis], rate, entry.resolution, config)
-    kinematics = Kinematics(
-        "kalman" if config.method == "auto" else config.method,
-        rate,
-        filters,
-        min(config.force_cutoff_hz or _FORCE_CUTOFF_HZ, _HIGHEST_CUTOFF * rate),
-    )
+    kinematics, about = _choose_kinematics(records, session, config)
     path = out / "filter/kinematics.parquet"
     written = _write_motions(path, samples, ids, kinematics, progress)
     progress(0.9, "the band of motion and force")
     system = compile_model(Model(load_device(run, session.device)))
     names = [k for k in ids if k in written.interpolated]
-    # The band of residuals, from some of the trials just written, spread over the session.
-    sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
-    some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS_OF_BAND)).round())
-    motions = _motions(path, [names[int(k)] for k in some], system, {})
-    bands = find_band(system, motions, sensors, kinematics, config.band_hz)
+    bands = _find_bands(path, names, system, session, kinematics, config)
     widest = max(band.cutoff_hz for band in bands.values())
     needed = min(_CUTOFF_OVER_BAND * widest, _HIGHEST_CUTOFF * rate)
     if not config.force_cutoff_hz and widest > LEAST_HZ and needed > kinematics.input_cutoff_hz:
@@ -200,7 +187,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         disturbances=disturbances,
         force_offsets=offsets,
         headline=f"{kinematics.method}, {count_noun(len(written.interpolated), 'trial')}; "
-        f"bandwidth {_list_hz({axis: one.bandwidth_hz for axis, one in filters.items()})};"
+        f"bandwidth {_list_hz({axis: one['bandwidth_hz'] for axis, one in about.items()})};"
         " residuals compared below "
         + _list_hz({axis: one.cutoff_hz for axis, one in bands.items()}),
     )
@@ -208,15 +195,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     setup = _inspect(system, path, session, names, of_kind - held_out, bands, disturbances)
     setup.write(out)
     notes = [f"{name}: not used: {reason}" for name, reason in written.skipped.items()]
-    notes += _describe_offsets(offsets, session)
-    for name, stretches in disturbances.items():
-        for reason in dict.fromkeys(one.reason for one in stretches):
-            of_it = [one for one in stretches if one.reason == reason]
-            where = f"{of_it[0].start_s:.1f} to {of_it[-1].end_s:.1f} s"
-            if len(of_it) > 1:
-                lasting = sum(one.end_s - one.start_s for one in of_it)
-                where = f"{len(of_it)} stretches, {lasting:.1f} s in all,"
-            notes.append(f"{name}: {where} left out: {reason}")
+    notes += [*_describe_offsets(offsets, session), *_describe_disturbances(disturbances)]
     return result.write(out) | {"setup": list_setup_faults(setup), "notes": notes}
 
 
@@ -246,6 +225,36 @@ def _nothing_to_differentiate(
         where=str(run.root),
         remedy='record trials in which the machine moves, kind = "free" in session.toml',
     )
+
+
+def _choose_kinematics(
+    records: Mapping[str, list[tuple[Array, Flags]]], session: IngestResult, config: Config
+) -> tuple[Kinematics, dict[str, dict[str, Any]]]:
+    """Return how to differentiate the trials, and by axis what a reader is told about it."""
+    rate, filters, about = session.sample_rate_hz, {}, {}
+    for axis, entry in session.axes.items():
+        filters[axis], about[axis] = _choose(axis, records[axis], rate, entry.resolution, config)
+    method = "kalman" if config.method == "auto" else config.method
+    cutoff = min(config.force_cutoff_hz or _FORCE_CUTOFF_HZ, _HIGHEST_CUTOFF * rate)
+    return Kinematics(method, rate, filters, cutoff), about
+
+
+def _find_bands(
+    path: Path,
+    names: Sequence[str],
+    system: System,
+    session: IngestResult,
+    kinematics: Kinematics,
+    config: Config,
+) -> dict[str, ResidualBand]:
+    """Return the band of residuals of each axis, from some of the trials, spread over the session.
+
+    ``path`` holds the motions of the trials ``names``.
+    """
+    sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
+    some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS_OF_BAND)).round())
+    motions = _motions(path, [names[int(k)] for k in some], system, {})
+    return find_band(system, motions, sensors, kinematics, config.band_hz)
 
 
 def _write_motions(
@@ -308,6 +317,18 @@ def _describe_offsets(
             f"{name} is zeroed anew in each trial: its offsets from their mean ({each} {unit})"
             " were subtracted; those of held-out trials come from their own samples"
         )
+
+
+def _describe_disturbances(disturbances: Mapping[str, Sequence[Disturbance]]) -> Iterator[str]:
+    """Return a sentence on the stretches of a trial that are left out for one reason."""
+    for name, stretches in disturbances.items():
+        for reason in dict.fromkeys(one.reason for one in stretches):
+            of_it = [one for one in stretches if one.reason == reason]
+            where = f"{of_it[0].start_s:.1f} to {of_it[-1].end_s:.1f} s"
+            if len(of_it) > 1:
+                lasting = sum(one.end_s - one.start_s for one in of_it)
+                where = f"{len(of_it)} stretches, {lasting:.1f} s in all,"
+            yield f"{name}: {where} left out: {reason}"
 
 
 def _inspect(
