@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.estimate import filterpy_engine
-from bampipe.estimate.unscented import ALPHA, FilterModel, FilterSettings, Trial, filter_trials
+from bampipe.estimate.square_root import ALPHA, FilterSettings
+from bampipe.estimate.unscented import FilterModel, Trial, filter_trials
 from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.system import System
@@ -251,7 +252,7 @@ def by_dynamax(problem: Problem, python: str, folder: Path, repeats: int) -> Mea
     # dynamax starts with a reading; here the first reading follows a prediction.
     start = replace(trial, t=trial.t[:2], u=trial.u[:2], y=np.full_like(trial.y[:2], np.nan))
     ahead = filter_trials(
-        problem.model, [start], problem.mean, problem.covariance, replace(settings, stride=1)
+        problem.model, [start], problem.mean, problem.covariance, settings._replace(stride=1)
     ).trials[0]
     dt = np.diff(trial.t)
     steps = np.unique(np.ceil(dt / settings.longest_step - 1e-6))

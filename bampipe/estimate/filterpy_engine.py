@@ -13,13 +13,12 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.estimate.runge_kutta import runge_kutta
+from bampipe.estimate.square_root import ALPHA, FilterSettings
 from bampipe.estimate.unscented import (
-    ALPHA,
     FilteredTrial,
     FilterFailure,
     FilterModel,
     FilterOutcome,
-    FilterSettings,
     Trial,
     in_sequence,
 )

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.arrays import Array
+from bampipe.estimate.square_root import FilterSettings
 from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterModel,
-    FilterSettings,
     Trial,
     join_roots,
     run_kernel,
@@ -67,9 +67,8 @@ class OnlineFilter:
             u = np.vstack([self._last[1], u])
             y = np.vstack([np.full(ny, np.nan), y])
         samples = Trial(t, u, y, np.zeros(0), np.zeros(0))
-        found = run_kernel(
-            self._model, self._settings, samples, self.mean, self._root, stride=t.size
-        )
+        settings = self._settings._replace(stride=t.size)
+        found = run_kernel(self._model, settings, samples, self.mean, self._root)
         own = slice(0 if self._last is None else 1, None)
         self._last = (float(t[-1]), np.array(u[-1]))
         by_sample = ("innovation", "innovation_sd", "nis", "log_likelihood")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import float64, int64, types
 
-from bampipe.arrays import Array
+from bampipe.arrays import Array, Indices
 from bampipe.compiled import njit, record_type
 from bampipe.estimate.propagation import (
     ESTIMATED,
@@ -36,25 +36,31 @@ _V = float64[::1]
 _M = float64[:, ::1]
 
 
-class Levels(NamedTuple):
-    """Noise and numerical settings, as the kernel takes them.
+ALPHA = (2.0 - 3.0**0.5) ** 0.5
+"""Spread of the scaled sigma points (Van der Merwe 2004, with beta = 2 and kappa = 0): the smallest
+without negative weights in a covariance. The central weight is then zero, so that a covariance is a
+sum of positive terms; with the usual 1e-3, rounding alone costs nine digits."""
+_SPREAD = ALPHA**2
+
+
+class FilterSettings(NamedTuple):
+    """Noise levels and numerical settings.
 
     Attributes:
-        process_sd: (nw,) of the process noise of each sample.
+        observed: (ny,) indices of the model's measurements that ``Trial.y`` contains.
+        reading_sd: (ny,) standard deviation of the measurement noise, which is additive.
+        noise_sd: (nw,) standard deviation of the process noise of one sample.
         walk_sd: (nt,) random walk of the parameters, per square root of a second.
-        reading_sd: (ny,) of the measurement noise, additive.
-        spread: squared distance of the sigma points, in variances; the central one has no weight
-            in a covariance, the others have equal ones.
-        longest_step: of the Runge-Kutta method, s.
-        stride: of the stored distributions, samples.
+        longest_step: longest Runge-Kutta step, s.
+        stride: number of samples from one stored distribution to the next.
     """
 
-    process_sd: Array
-    walk_sd: Array
+    observed: Indices
     reading_sd: Array
-    spread: float
-    longest_step: float
-    stride: int
+    noise_sd: Array
+    walk_sd: Array
+    longest_step: float = 1e-3
+    stride: int = 1
 
 
 @njit(
@@ -63,7 +69,7 @@ class Levels(NamedTuple):
         MEASURE_ROWS,
         ESTIMATED,
         _V,
-        record_type(Levels, _V, _V, _V, float64, float64, int64),
+        record_type(FilterSettings, int64[::1], _V, _V, _V, float64, int64),
         *(_V, _M, _M, _M),
         _V,
         _M,
@@ -72,7 +78,7 @@ class Levels(NamedTuple):
     fastmath={"contract"},
 )
 def filter_square_root(  # type: ignore[no-untyped-def]
-    derivative, measure, estimated, p, levels, t, u, curvature, y, mean, factor
+    derivative, measure, estimated, p, settings, t, u, curvature, y, mean, factor
 ):
     """Filter one trial, propagating the lower root of the covariance.
 
@@ -84,7 +90,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
 
     Args:
         derivative: f(count, x, u, p, w, dx); measure: h(count, x, u, p, y).
-        estimated, levels: the model and its noise.
+        estimated, settings: the model and its noise.
         p: (np + 1,) all parameters, then the input delay.
         t: (T,) s; u: (T, nu) inputs; curvature: (T, nu) their second time derivatives.
         y: (T, ny) readings, NaN where one is missing.
@@ -93,19 +99,22 @@ def filter_square_root(  # type: ignore[no-untyped-def]
 
     Returns:
         The reason for stopping, `DONE` if there was no fault, and the sample at which it stopped;
-        then means (R, n) and covariances (R, n, n) of every ``levels.stride``-th sample,
+        then means (R, n) and covariances (R, n, n) of every ``settings.stride``-th sample,
         innovations (T, ny) and their standard deviations, nis (T,) and log likelihood (T,), NaN
         where there is no reading.
     """
     nx, observed = estimated.n_states, estimated.observed
     lower, upper = estimated.lower, estimated.upper
-    process_sd, walk_sd, reading_sd = levels.process_sd, levels.walk_sd, levels.reading_sd
-    other, stride = 0.5 / levels.spread, levels.stride
+    noise_sd, walk_sd, reading_sd = settings.noise_sd, settings.walk_sd, settings.reading_sd
     n = mean.shape[0]
-    nw = process_sd.shape[0]
+    nw = noise_sd.shape[0]
     ny = observed.shape[0]
     nt = n - nx
-    reach = levels.spread**0.5
+    # The squared distance of the sigma points, in variances. In a covariance the central one has no
+    # weight, the others have equal ones.
+    spread = _SPREAD * (n + nw)
+    other, stride = 0.5 / spread, settings.stride
+    reach = spread**0.5
     half = (0.5 * other) ** 0.5
     pairs = n + nw
     wide = padded(n)
@@ -133,9 +142,9 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     covariance_of(root, covariances[0])
     for k in range(1, size):
         dt = t[k] - t[k - 1]
-        substeps = max(1, int(np.ceil(dt / levels.longest_step - 1e-6)))
+        substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
         propagate_points(
-            derivative, estimated, mean, factor, reach, process_sd, u[k - 1], u[k],
+            derivative, estimated, mean, factor, reach, noise_sd, u[k - 1], u[k],
             curvature[k - 1], curvature[k], dt, substeps, images, points,
         )  # fmt: skip
         for i in range(nx):

@@ -30,7 +30,7 @@ from bampipe.estimate.square_root import (
     DONE,
     INNOVATION_NOT_POSITIVE,
     NOT_FINITE,
-    Levels,
+    FilterSettings,
     filter_square_root,
 )
 
@@ -38,10 +38,6 @@ _REASONS = {
     NOT_FINITE: "the predicted motion grew without bound",
     INNOVATION_NOT_POSITIVE: "the covariance of the innovation lost positive definiteness",
 }
-ALPHA = (2.0 - 3.0**0.5) ** 0.5
-"""Spread of the scaled sigma points (Van der Merwe 2004, with beta = 2 and kappa = 0): the smallest
-without negative weights in a covariance. The central weight is then zero, so that a covariance is a
-sum of positive terms; with the usual 1e-3, rounding alone costs nine digits."""
 _NOT_A_SPREAD = (
     "the spread of the parameters is no longer positive definite: the priors are far too wide, or"
     " some parameters cannot be distinguished"
@@ -130,27 +126,6 @@ class FilterModel:
             value[..., log] = np.exp(value[..., log])
         slope[..., log] = value[..., log]
         return value, slope
-
-
-@dataclass(frozen=True)
-class FilterSettings:
-    """Noise levels and numerical settings.
-
-    Attributes:
-        observed: (ny,) indices of the model's measurements that ``Trial.y`` contains.
-        reading_sd: (ny,) standard deviation of the measurement noise.
-        noise_sd: (nw,) standard deviation of the process noise of one sample.
-        walk_sd: (nt,) random walk of the parameters, per square root of a second.
-        longest_step: longest Runge-Kutta step, s.
-        stride: number of samples from one stored distribution to the next.
-    """
-
-    observed: Indices
-    reading_sd: Array
-    noise_sd: Array
-    walk_sd: Array
-    longest_step: float = 1e-3
-    stride: int = 1
 
 
 @dataclass(frozen=True)
@@ -254,7 +229,7 @@ def filter_trials(
         mean = np.concatenate([trial.x, theta])
         try:
             root = join_roots(trial.x_sd, covariance)
-            filtered = run_kernel(model, settings, trial, mean, root, settings.stride)
+            filtered = run_kernel(model, settings, trial, mean, root)
         except FilterFailure as failure:
             raise FilterFailure(index, failure.sample, failure.reason) from None
         except ValueError as error:
@@ -286,41 +261,34 @@ def in_sequence(
 
 
 def run_kernel(
-    model: FilterModel,
-    settings: FilterSettings,
-    trial: Trial,
-    mean: Array,
-    root: Array,
-    stride: int,
+    model: FilterModel, settings: FilterSettings, trial: Trial, mean: Array, root: Array
 ) -> FilteredTrial:
     """Filter consecutive samples of ``trial``, whose initial state is not used.
 
     ``mean`` (n,), state and parameters, and ``root`` (n, n), the lower root of their covariance,
-    are those at the first sample, and are overwritten with those at the last. ``stride`` is the
-    number of samples from one stored distribution to the next.
+    are those at the first sample, and are overwritten with those at the last.
 
     Raises:
         FilterFailure: the covariance lost positive definiteness or a number is not finite; the
             trial has the number 0.
     """
-    p, spread = _array(model.parameters), ALPHA**2 * (mean.size + settings.noise_sd.size)
+    p, (observed, *sds, longest_step, stride) = _array(model.parameters), settings
     estimated = Estimated(
         model.n_states, p.size - 1, _array(model.free, np.int64),
-        _array(model.logarithmic, np.bool_), *model.range, _array(settings.observed, np.int64),
+        _array(model.logarithmic, np.bool_), *model.range, _array(observed, np.int64),
         model.reads_parameters,
     )  # fmt: skip
-    levels = Levels(
-        _array(settings.noise_sd), _array(settings.walk_sd), _array(settings.reading_sd),
-        spread, float(settings.longest_step), int(stride),
-    )  # fmt: skip
+    given = FilterSettings._make(
+        (estimated.observed, *map(_array, sds), float(longest_step), int(stride))
+    )
     samples = [*map(_array, (trial.t, trial.u, trial.input_curvature, trial.y))]
     ended, sample, found = filter_square_root(
-        model.functions.derivative_rows, model.functions.measure_rows, estimated, p, levels,
+        model.functions.derivative_rows, model.functions.measure_rows, estimated, p, given,
         *samples, mean, root,
     )  # fmt: skip
     if ended != DONE:
         raise FilterFailure(0, sample, _REASONS[ended])
-    return FilteredTrial(samples[0][::stride], *found)
+    return FilteredTrial(samples[0][:: int(stride)], *found)
 
 
 def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:

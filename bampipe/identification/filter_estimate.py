@@ -11,9 +11,9 @@ import numpy as np
 from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.filter_uncertainty import choose_block, sandwich_covariance
+from bampipe.estimate.square_root import FilterSettings
 from bampipe.estimate.unscented import (
     FilterFailure,
-    FilterSettings,
     Trial,
     constrain,
     filter_trials,
@@ -132,7 +132,7 @@ class Filtering:
         walk = np.append(settings.walk_sd, np.zeros(self.late_sd.size))
         places, samples = choose_tuning_trials(sizes)
         tuned = tune_noise(
-            replace(settings, walk_sd=walk),
+            settings._replace(walk_sd=walk),
             self.model,
             [self.trials[place].first(samples) for place in places],
             [np.asarray(self.clear(place)[:samples].all(axis=1)) for place in places],
@@ -140,7 +140,7 @@ class Filtering:
             noise,
             choice,
         )
-        self.settings = replace(tuned, stride=stride)
+        self.settings = tuned._replace(stride=stride)
 
     def narrowed(self, factor: float) -> System:
         """The model with the widths of its smoothed signs multiplied by a factor."""
@@ -206,7 +206,7 @@ class Filtering:
         value, slope = self.model.to_physical(found.theta)
         around = _AROUND * slope * np.sqrt(np.diag(found.covariance))
         with suppress(MotionLost):  # a narrow sign may make it diverge at a single reversal
-            settings = replace(found.settings, longest_step=widths.step / width.parts)
+            settings = found.settings._replace(longest_step=widths.step / width.parts)
             again = self.run([(value, around, 1.0)], settings)
             if again.log_likelihood > found.log_likelihood + _LIKELIER:
                 first = found.first or found.passes
@@ -360,8 +360,8 @@ class _Widths:
             model = self.model
             if width != self.width:
                 model = replace(model, functions=self.narrowed(width))
-            settings = replace(
-                self.found.settings, longest_step=self.step / parts, stride=_MOVED_SAMPLES
+            settings = self.found.settings._replace(
+                longest_step=self.step / parts, stride=_MOVED_SAMPLES
             )
             with suppress(FilterFailure):
                 outcome = filter_trials(model, self.some, theta, self.covariance, settings)

@@ -1,7 +1,7 @@
 """The unscented filter on raw samples: a search on the first trial, then a pass over all trials."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,11 +11,11 @@ from bampipe.errors import InputError
 from bampipe.estimate.differentiation import spline_curvature
 from bampipe.estimate.filter_uncertainty import at_block_ends
 from bampipe.estimate.innovations import average_stretches
+from bampipe.estimate.square_root import FilterSettings
 from bampipe.estimate.unscented import (
     FilterFailure,
     FilterModel,
     FilterOutcome,
-    FilterSettings,
     Stored,
     Trial,
     filter_trials,
@@ -278,8 +278,8 @@ def follow_trials(
     why, found = "", None
     for restarts, (value, sd, factor) in enumerate(attempts):
         mean, spread = model.to_estimated(value, sd)
-        level = replace(settings, noise_sd=factor * settings.noise_sd)
-        coarse = replace(level, noise_sd=_COARSE * level.noise_sd)
+        level = settings._replace(noise_sd=factor * settings.noise_sd)
+        coarse = level._replace(noise_sd=_COARSE * level.noise_sd)
         place = 0
         try:
             report_progress(0.0, names[place])

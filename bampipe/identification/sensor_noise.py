@@ -10,10 +10,10 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import Array, Flags
 from bampipe.estimate.filter_uncertainty import climb
+from bampipe.estimate.square_root import FilterSettings
 from bampipe.estimate.unscented import (
     FilterFailure,
     FilterModel,
-    FilterSettings,
     Trial,
     filter_trials,
 )
@@ -173,7 +173,7 @@ def tune_noise(
         choice: may fix some levels.
     """
     longest = max(settings.longest_step, _TUNING_STEP_S)
-    quick = replace(settings, longest_step=longest, stride=TUNING_SAMPLES)  # store no distributions
+    quick = settings._replace(longest_step=longest, stride=TUNING_SAMPLES)  # store no distributions
     counts = np.concatenate(clear)
     counts = counts if counts.any() else np.ones(counts.size, dtype=bool)
     value, sd = near
@@ -182,8 +182,8 @@ def tune_noise(
 
     def with_levels(levels: Array) -> FilterSettings:
         reading, *process = np.exp(levels)
-        return replace(
-            quick, reading_sd=quick.reading_sd * reading, noise_sd=quick.noise_sd * process
+        return quick._replace(
+            reading_sd=quick.reading_sd * reading, noise_sd=quick.noise_sd * process
         )
 
     def log_likelihood(levels: Array) -> float:
@@ -202,7 +202,7 @@ def tune_noise(
     if choice.force_noise > 0.0:
         step[1:][noise.is_force] = 0.0
     best, _ = climb(log_likelihood, np.zeros(count + 1), step, lower)
-    return replace(with_levels(best), longest_step=settings.longest_step, stride=settings.stride)
+    return with_levels(best)._replace(longest_step=settings.longest_step, stride=settings.stride)
 
 
 def noise_levels(system: System, settings: FilterSettings, noise: Noise) -> NoiseLevels:

@@ -14,10 +14,10 @@ from bampipe.data.stream import SampleStream, StreamLayout
 from bampipe.declarations.model_file import load_model
 from bampipe.errors import InputError
 from bampipe.estimate.consistency import Reference, window_means
+from bampipe.estimate.square_root import FilterSettings
 from bampipe.estimate.unscented import (
     FilterFailure,
     FilterModel,
-    FilterSettings,
     Trial,
     filter_trials,
 )

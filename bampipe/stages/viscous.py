@@ -117,9 +117,9 @@ def _estimated(
     settings = untuned_settings(system, noise, config)
     if identified.noise is not None and config.force_noise == 0.0:
         found_sd = [identified.noise.process_sd[name] for name in system.noise]
-        settings = replace(settings, noise_sd=np.array(found_sd))
+        settings = settings._replace(noise_sd=np.array(found_sd))
     stride = choose_stride(motions)
-    settings = replace(settings, stride=stride)
+    settings = settings._replace(stride=stride)
     brakes = [name in system.model.device.brakes.values() for name in system.inputs]
     readings = []
     for motion in motions:

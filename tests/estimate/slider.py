@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 
 from bampipe import compiled
-from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial
+from bampipe.estimate.square_root import FilterSettings
+from bampipe.estimate.unscented import FilterModel, Trial
 from bampipe.model_functions import DERIVATIVE, DERIVATIVE_ROWS, MEASURE, MEASURE_ROWS, ROWS
 
 TRUTH = np.array([4.0, 1.1, 2.0])

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +88,7 @@ def test_same_estimates_as_the_batch_filter(run: RunFolder, begun: tuple) -> Non
     batch = filter_trials(
         start.model,
         [Trial(values[:, 0].copy(), u, y, *start.state(system, y[0], u[0]))],
-        start.theta, start.covariance, replace(start.settings, stride=1),
+        start.theta, start.covariance, start.settings._replace(stride=1),
     )  # fmt: skip
     report = monitor.report()
     theta, _ = start.model.to_physical(batch.theta)
