@@ -21,14 +21,7 @@ def zero_phase(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, 
     ``cutoff_hz``, the half-power frequency of one pass, both passes transmit half of the amplitude.
     """
     x, added = _low_passed(values, rate_hz, cutoff_hz)
-    inner = np.arange(added, added + len(values))
-    ahead, behind = x[np.minimum(inner + 1, len(x) - 1)], x[np.maximum(inner - 1, 0)]
-    ahead2, behind2 = x[np.minimum(inner + 2, len(x) - 1)], x[np.maximum(inner - 2, 0)]
-    velocity = (8.0 * (ahead - behind) - (ahead2 - behind2)) * rate_hz / 12.0
-    acceleration = (16.0 * (ahead + behind) - (ahead2 + behind2) - 30.0 * x[inner]) * (
-        rate_hz**2 / 12.0
-    )
-    return x[inner], velocity, acceleration
+    return x[added : added + len(values)], *_differences(x, added, rate_hz, 2)
 
 
 def rates(values: Array, rate_hz: float, cutoff_hz: float, count: int) -> list[Array]:
@@ -42,21 +35,25 @@ def rates(values: Array, rate_hz: float, cutoff_hz: float, count: int) -> list[A
     found: list[Array] = []
     while len(found) < count:
         x, added = _low_passed(found[-1] if found else values, rate_hz, cutoff_hz)
-        padded = np.pad(x, _REACH, mode="edge")
-        for order, weights in enumerate(_difference_weights(), start=1):
-            difference = np.convolve(padded, weights[::-1], mode="valid") * rate_hz**order
-            found.append(difference[added : added + len(values)])
+        found += _differences(x, added, rate_hz, _REACH)
     return found[:count]
 
 
-@lru_cache(maxsize=1)
-def _difference_weights() -> tuple[Array, Array]:
-    """Weights (2 _REACH + 1,) of samples in central differences, first and second order.
+def _differences(x: Array, added: int, rate_hz: float, reach: int) -> tuple[Array, Array]:
+    """Return two derivatives of ``x`` without the samples ``added`` at its ends, each (T,)."""
+    padded, inner = np.pad(x, reach, mode="edge"), slice(added, len(x) - added)
+    first, second = (np.convolve(padded, w[::-1], mode="valid") for w in _find_weights(reach))
+    return rate_hz * first[inner], rate_hz**2 * second[inner]
+
+
+@lru_cache
+def _find_weights(reach: int) -> tuple[Array, Array]:
+    """Weights (2 reach + 1,) of samples in central differences, first and second order.
 
     They follow from the polynomial through all samples (Fornberg 1988, Mathematics of Computation
     51, 699).
     """
-    at = np.arange(-_REACH, _REACH + 1)
+    at = np.arange(-reach, reach + 1)
     inverse = np.linalg.inv(np.vander(at.astype(float), increasing=True))
     return np.asarray(inverse[1]), np.asarray(2.0 * inverse[2])
 

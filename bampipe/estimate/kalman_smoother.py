@@ -17,7 +17,7 @@ from functools import lru_cache
 from math import factorial
 
 import numpy as np
-from numba import boolean, float64, int64, types, void
+from numba import boolean, float64, types, void
 from scipy.optimize import minimize_scalar
 
 from bampipe.arrays import Array, Flags
@@ -26,6 +26,7 @@ from bampipe.estimate.differentiation import Derivatives
 
 ORDERS = (3, 4)
 _SETTLED = 1e-10
+"""Relative change of the gains from sample to sample below which they are constant."""
 _WIDE = 1e8
 """Ratio of the prior variance of an unknown initial state to its later variance."""
 
@@ -127,14 +128,16 @@ innovations (T,) and their variances (T,)."""
 
 @njit(_PASS(_V, _FLAGS, _M, _M, _V, _M), cache=True)
 def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
-    """Run the filter from prior ``x``, ``p`` for the first sample and return what it passes."""
+    """Run the filter from prior ``x``, ``p`` for the first sample and return what it passes.
+
+    Once the gains have settled, they are kept until a sample is missing.
+    """
     count, n = y.shape[0], x.shape[0]
     states, covariances, gains = np.empty((count, n)), np.empty((count, n, n)), np.zeros((count, n))
     innovations, spreads, work = np.zeros(count), np.ones(count), np.empty((n, n))
     settled = False
     for t in range(count):
         if settled and present[t]:
-            # Bitwise as after the last sample, so all that follows is equal.
             _advance(x, step)
             innovations[t], spreads[t] = y[t] - x[0], spreads[t - 1]
             for i in range(n):
@@ -145,7 +148,9 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
                 _predict(x, p, step, noise, work)
             if present[t]:
                 innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
-            settled = t > 0 and present[t] and present[t - 1] and (p == covariances[t - 1]).all()
+            settled = present[t] and t > 4 * n
+            for i in range(n):
+                settled &= abs(gains[t, i] - gains[t - 1, i]) < _SETTLED * abs(gains[t, i])
         for i in range(n):
             states[t, i] = x[i]
             for j in range(n):
@@ -198,40 +203,6 @@ def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
                     total += step[k, i] * left[k, j]
                 weight[i, j] = total
                 weight[j, i] = total
-
-
-@njit(types.Tuple((float64, float64, int64))(_V, _FLAGS, _M, _M, _V, _M, int64), cache=True)
-def _evidence(y, present, step, noise, x, p, skip):  # type: ignore[no-untyped-def]
-    """Return sums of log S and v²/S over the innovations after ``skip``, and their count.
-
-    Once the gains have settled, they are kept until a sample is missing.
-    """
-    n = x.shape[0]
-    work, gain, before = np.empty((n, n)), np.empty(n), np.empty(n)
-    logs, squares, count = 0.0, 0.0, 0
-    settled, spread = False, 1.0
-    for t in range(y.shape[0]):
-        if settled and present[t]:
-            _advance(x, step)
-            innovation = y[t] - x[0]
-            for i in range(n):
-                x[i] += gain[i] * innovation
-        else:
-            if t > 0:
-                _predict(x, p, step, noise, work)
-            if not present[t]:
-                settled = False
-                continue
-            before[:] = gain
-            innovation, spread = _update(x, p, y[t], gain)
-            settled = t > 4 * n
-            for i in range(n):
-                settled &= abs(gain[i] - before[i]) < _SETTLED * abs(gain[i])
-        if t >= skip:
-            logs += np.log(spread)
-            squares += innovation * innovation / spread
-            count += 1
-    return logs, squares, count
 
 
 def _prior(y: Array, order: int) -> tuple[Array, Array]:
@@ -422,10 +393,12 @@ def maximum_likelihood(
         logs = squares = 0.0
         count = 0
         for (y, present), (start, spread) in zip(scaled, priors, strict=True):
-            part = _evidence(
-                y, present, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order
-            )
-            logs, squares, count = logs + part[0], squares + part[1], count + part[2]
+            ratio_noise = np.exp(log_ratio) * noise
+            *_, off, scale = _filter(y, present, step, ratio_noise, start.copy(), spread.copy())
+            late = np.flatnonzero(present[4 * order :]) + 4 * order
+            logs += float(np.log(scale[late]).sum())
+            squares += float((off[late] ** 2 / scale[late]).sum())
+            count += late.size
         best = squares / max(count, 1)
         variance = max(best, 1.0) if quantum > 0.0 else max(best, 1e-30)
         return 0.5 * (logs + count * np.log(variance) + squares / variance), variance
