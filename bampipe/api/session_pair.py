@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -326,41 +326,39 @@ def _refit(e: Linearisation, chosen: list[int], limits: Array) -> Refit:
     if not all(e.system.constant[free[k]] for k in chosen):
         for _ in range(_REFIT_STEPS):
             p = e.p.copy()
-            p[[free[k] for k in chosen]] += step
+            p[free] += step
             e = linearise_fit(e.system, e.motions, e.band, p, e.folds, most_iterations=0)
             step, error = _solve(e, chosen, limits)
-    names = [e.system.parameters[free[k]].name for k in chosen]
-    change = e.p[[free[k] for k in chosen]] + step - start[[free[k] for k in chosen]]
+    change = (e.p - start)[free] + step
+    errors = dict(zip(e.system.coordinates, map(float, error), strict=True))
     return Refit(
-        changes=dict(zip(names, map(float, change), strict=True)),
-        errors=dict(zip(e.system.coordinates, map(float, error), strict=True)),
-        travels=tuple(
-            axis for axis, x, y in zip(e.system.coordinates, error, limits, strict=True) if x <= y
-        ),
+        changes={e.system.parameters[free[k]].name: float(change[k]) for k in chosen},
+        errors=errors,
+        travels=tuple(axis for (axis, x), y in zip(errors.items(), limits, strict=True) if x <= y),
     )
 
 
 def _solve(e: Linearisation, chosen: list[int], limits: Array) -> tuple[Array, Array]:
-    """Return a linear step of some free parameters, and its held-out error, (n_q,)."""
-    sums, groups = e.sums, np.array(e.folds.groups)
-    fitted, judged = np.array(e.folds.fitted), np.array(e.folds.judged)
-    xx = sums.xx[:, :, chosen][:, :, :, chosen]
-    xy, weight = sums.xy[:, :, chosen], limits**-2
+    """Return a linear step of the free parameters, and its held-out error, (n_q,).
+
+    Those that are not ``chosen`` stay. Priors do not count: they held in the other session.
+    """
+    sums = replace(e.sums, precision=np.zeros(len(e.free)))
+    groups, judged, fitted = map(np.array, (e.folds.groups, e.folds.judged, e.folds.fitted))
+    moves = np.isin(range(len(e.free)), chosen)
+    lower, upper = np.where(moves, [e.lower, e.upper], 0.0)
 
     def solve(rows: Flags) -> Array:
-        left = np.einsum("kaij,a->ij", xx[rows], weight)
-        right = np.einsum("kai,a->i", xy[rows], weight)
-        step = np.linalg.lstsq(left, right, rcond=1e-12)[0]
-        return np.asarray(np.clip(step, e.lower[chosen], e.upper[chosen]))
+        return sums.subset(np.flatnonzero(rows).tolist()).solve(limits**-2, lower, upper)
 
-    total = np.zeros(len(limits))
+    total, count = np.zeros((2, len(limits)))
     for group in np.unique(groups[judged]):
         others = fitted & (groups != group)
-        step, inside = solve(others if others.any() else fitted), judged & (groups == group)
-        total += sums.yy[inside].sum(axis=0) - 2.0 * xy[inside].sum(axis=0) @ step
-        total += np.einsum("kaij,i,j->a", xx[inside], step, step)
-    count = np.maximum(sums.count[judged].sum(axis=0), 1.0)
-    return solve(fitted), np.sqrt(np.maximum(total, 0.0) / count)
+        part = sums.subset(np.flatnonzero(judged & (groups == group)).tolist())
+        size = part.count.sum(axis=0)
+        total += size * part.mean_square(solve(others if others.any() else fitted))
+        count += size
+    return solve(fitted), np.sqrt(total / np.maximum(count, 1.0))
 
 
 def _find_lacking(model: _Side, trials: _Side, axes: Collection[str]) -> dict[str, object]:
