@@ -1,8 +1,6 @@
 """Collect the runs of a lab: tables, trends and a report, from all stages that have run."""
 
 import os
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -71,7 +69,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         raise InputError(
             "holds other files", where=str(folder), remedy="choose another folder with --out"
         )
-    with _lock(folder):
+    with hold(folder, LOCK):  # simultaneous collections take turns
         counts = lab_tables.write(folder, tables)
         content.write(folder)
         if report:
@@ -96,15 +94,3 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
         ).write(folder)
     return Lab(folder, content, sessions, tuple(skipped))
-
-
-@contextmanager
-def _lock(folder: Path) -> Iterator[None]:
-    """Lock the lab's folder, so that simultaneous collections take turns."""
-    with ExitStack() as stack:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(hold(folder / LOCK))
-        except OSError as error:
-            raise InputError(f"cannot be written: {error.strerror}", where=str(folder)) from error
-        yield

@@ -1,12 +1,11 @@
 """``run.json``, the record of inputs, settings and results of every step; and the run's lock."""
 
-import contextlib
-import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from bampipe.errors import InputError
-from bampipe.files import STORAGE_FAULTS, digest_file
+from bampipe.files import digest_file
 from bampipe.results.run import PRIVATE, RunResult
 from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.lock import hold
@@ -57,36 +56,10 @@ def touched(root: Path, name: str, step: str) -> InputError:
     return InputError(f"{name} was changed since {step} wrote it", where=str(root), remedy=remedy)
 
 
-@contextlib.contextmanager
-def lock(root: Path, wait: bool, listen: Listener = ignore_event) -> Iterator[None]:
-    """Hold the run folder ``root``, creating it if needed; faults of the disk are `InputError`.
+def lock(root: Path, wait: bool, listen: Listener = ignore_event) -> AbstractContextManager[None]:
+    """Hold the run folder ``root``, as `hold` does; ``listen`` hears of other holders."""
 
-    Args:
-        wait: whether to wait while another process holds it; otherwise refuse.
-        listen: called before waiting, and if the last holder was killed.
+    def tell(kind: str, holder: str) -> None:
+        listen(Event(root.name, "", kind, message=holder))
 
-    Raises:
-        InputError: another process holds it and ``wait`` is false; or the disk is full, read-only
-            or otherwise faulty.
-    """
-
-    def tell(kind: str) -> Callable[[str], None]:
-        return lambda holder: listen(Event(root.name, "", kind, message=holder))
-
-    private = root / PRIVATE
-    try:
-        private.mkdir(parents=True, exist_ok=True)
-        with hold(private / "lock", wait, tell("waiting"), tell("taken over")):
-            yield
-    except FileNotFoundError as error:
-        if private.exists():
-            raise
-        raise InputError("no folder can be made here", where=str(root)) from error
-    except OSError as error:
-        if error.errno not in STORAGE_FAULTS:
-            raise
-        raise InputError(
-            STORAGE_FAULTS[error.errno],
-            where=os.fspath(error.filename or root),
-            remedy="earlier results are untouched",
-        ) from error
+    return hold(root, f"{PRIVATE}/lock", wait, tell)
