@@ -6,6 +6,7 @@ import pytest
 from made_results import diagnosis, filled, write_result
 
 from bampipe.api import loop
+from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model import ModelFile
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
@@ -110,7 +111,7 @@ def test_a_child_that_was_never_identified_is_removed(
     options = loop.LoopOptions(Request(tmp_path, pipeline.load()), ignore_event)
     with pytest.raises(fault):
         loop.extend(options, "base", ["stribeck:carriage"])
-    assert models.names(tmp_path) == ("base",)
+    assert RunFolder(tmp_path).models() == ("base",)
 
 
 def test_identification_starts_where_the_diagnosis_ended_if_it_fitted_all(

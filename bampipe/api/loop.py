@@ -65,7 +65,7 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
     A child is thus identified and judged like its parent.
     """
     line = [model]
-    while line[-1] in models.names(root) and models.read(root, line[-1]).parent:
+    while line[-1] in RunFolder(root).models() and models.read(root, line[-1]).parent:
         line.append(models.read(root, line[-1]).parent)
     made = record.read(root).stages
     used: dict[str, dict[str, object]] = {}

@@ -363,7 +363,7 @@ def _solve(e: Linearisation, chosen: list[int], limits: Array) -> tuple[Array, A
 
 def _find_lacking(model: _Side, trials: _Side, axes: Collection[str]) -> dict[str, object]:
     """Return the effects that a model with the same effects lacks in the other session."""
-    root, found = trials.run.root, models.names(trials.run.root)
+    root, found = trials.run.root, trials.run.models()
     alike = (m for m in found if {*models.read(root, m).effects} == {*model.effects})
     name = next(alike, trials.model)
     if not trials.run.exists(DiagnoseResult.file(name)):

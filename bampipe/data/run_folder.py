@@ -59,8 +59,7 @@ class RunFolder:
 
     def model_option(self, model: str) -> str:
         """Return `` --model`` with a model; "" where the run has no other."""
-        others = {path.parent.name for path in self.root.glob("models/*/model.toml")} - {model}
-        return f" --model {model}" if others else ""
+        return f" --model {model}" if {*self.models()} - {model} else ""
 
     def read(self, kind: type[R], model: str = "") -> R:
         """Return the result ``kind``, of ``model`` where it is one of a model.
@@ -73,6 +72,11 @@ class RunFolder:
     def find(self, kind: type[R], model: str = "") -> R | None:
         """Return the result as `read` does; None where its stage has not run."""
         return self.read(kind, model) if self.exists(kind.file(model)) else None
+
+    def models(self, file: str = "model.toml") -> tuple[str, ...]:
+        """Return the models that have ``file``: parents before children, then by name."""
+        found = (path.parent.name for path in self.root.glob(f"models/*/{file}"))
+        return tuple(sorted(found, key=lambda name: (name != "base", name.count("+"), name)))
 
     def glob(self, pattern: str) -> tuple[str, ...]:
         """Return the files that match ``pattern``, relative to the run folder, sorted."""

@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -73,10 +72,7 @@ class Recording:
 def gather_recording(run: RunFolder) -> Recording:
     """Gather the content of a run folder; raise `InputError` if no model has been validated."""
     session = run.read(IngestResult)
-    models = sorted(
-        (Path(path).parent.name for path in run.glob("models/*/residuals.parquet")),
-        key=lambda name: (name != "base", name.count("+"), name),
-    )
+    models = run.models("residuals.parquet")
     if not models:
         remedy = f"run `bampipe validate {run.root}` first"
         raise InputError("no model has been validated yet", where=str(run.root), remedy=remedy)

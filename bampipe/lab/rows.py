@@ -45,10 +45,10 @@ def read_run(root: Path) -> SessionRows:
     Raises:
         InputError: ingest has not run, or a result is damaged or was changed since it was written.
     """
-    made = models.names(root)
+    run = RunFolder(root)
+    made = run.models()
     of_models = [f"models/{model}/{name}" for model in made for name in _OF_MODELS]
     record.require_untouched(root, [*_OF_SESSION, *of_models])
-    run = RunFolder(root)
     session = run.read(IngestResult)
     try:
         recorded = lab_tables.moment(session.recorded_at)

@@ -124,10 +124,7 @@ class Results:
     @cached_property
     def models(self) -> tuple[str, ...]:
         """The models: in the order of the ladder, then all others, parents before children."""
-        found = sorted(
-            (path.parent.name for path in (self.root / "models").glob("*/identify.json")),
-            key=lambda name: (name != "base", name.count("+"), name),
-        )
+        found = RunFolder(self.root).models("identify.json")
         compared = self.read(CompareResult)
         ladder = [rung.model for rung in compared.ladder] if compared else []
         ranked = [name for name in ladder if name in found]

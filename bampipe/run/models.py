@@ -20,17 +20,12 @@ ADOPTED = "effects"
 """Folder beside the run folders with the lab's own effect files, for every run."""
 
 
-def names(root: Path) -> tuple[str, ...]:
-    """Return the models of the run folder ``root``: parents before children, then by name."""
-    found = (path.parent.name for path in (root / "models").glob("*/model.toml"))
-    return tuple(sorted(found, key=lambda name: (name != BASE, name.count("+"), name)))
-
-
 def read(root: Path, name: str) -> ModelFile:
     """Read ``models/<name>/model.toml``."""
-    if name not in names(root):
-        known = names(root) or (BASE,)
-        raise InputError(f"no model {name!r}", where=str(root), remedy=choose_from(name, known))
+    known = RunFolder(root).models()
+    if name not in known:
+        remedy = choose_from(name, known or (BASE,))
+        raise InputError(f"no model {name!r}", where=str(root), remedy=remedy)
     return read_model_file(root / "models" / name / "model.toml")
 
 
@@ -50,7 +45,7 @@ def default_model(root: Path) -> str:
         best = RunFolder(root).read(CompareResult).best
     except InputError:  # it is missing or damaged, and compare will make it again
         return BASE
-    return best if best in names(root) else BASE
+    return best if best in RunFolder(root).models() else BASE
 
 
 def write(root: Path, model: ModelFile) -> None:

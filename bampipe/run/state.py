@@ -163,7 +163,7 @@ class RunState:
         counting = models.default_model(self.root)
         children = (
             name
-            for name in models.names(self.root)
+            for name in RunFolder(self.root).models()
             if name != models.BASE and (name == counting or Step(stage, name).name in self.records)
         )
         return (Step(stage, models.BASE), *(Step(stage, name) for name in children))

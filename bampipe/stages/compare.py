@@ -35,11 +35,11 @@ class Config:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Put the validated models of a run side by side, parents before children."""
-    models: dict[str, ModelFile] = {}
-    for path in run.glob("models/*/model.toml"):
-        name = Path(path).parent.name
-        if run.exists(f"models/{name}/validate.json"):
-            models[name] = read_model_file(run.path(path))
+    models = {
+        name: read_model_file(run.path(f"models/{name}/model.toml"))
+        for name in run.models()
+        if run.exists(ValidateResult.file(name))
+    }
     if not models:
         raise InputError(
             "no model has been validated yet",

@@ -40,7 +40,7 @@ def test_the_best_confirmed_model_counts(tmp_path: Path) -> None:
     add(tmp_path, "base+c.yaw", "base", yaw=0.25, pitch=0.2)
     found = compared(tmp_path)
     assert {rung.model: rung.confirmed for rung in found.ladder} == dict.fromkeys(
-        models.names(tmp_path), True
+        RunFolder(tmp_path).models(), True
     )
     assert found.best == models.default_model(tmp_path) == "base+a.yaw+b.yaw"
 
