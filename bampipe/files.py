@@ -223,21 +223,30 @@ def write_json(path: Path, value: object) -> None:
 
 
 def toml_text(table: Mapping[str, Any]) -> str:
-    """Return a table of text, numbers, booleans, lists and tables as TOML."""
+    """Return a table of text, numbers, booleans, times, lists and tables as TOML."""
     lines: list[str] = []
 
     def quoted(key: str) -> str:
         return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key)
 
-    def write(path: tuple[str, ...], content: Mapping[str, Any]) -> None:
-        tables = {key: value for key, value in content.items() if isinstance(value, Mapping)}
+    def write(path: tuple[str, ...], content: Mapping[str, Any], head: str = "[{}]") -> None:
+        tables = {
+            key: value
+            for key, value in content.items()
+            if isinstance(value[0] if isinstance(value, list) and value else value, Mapping)
+        }
         if path and (len(tables) < len(content) or not content):
-            lines.extend(["", "[" + ".".join(map(quoted, path)) + "]"])
+            lines.extend(["", head.format(".".join(map(quoted, path)))])
         for key, value in content.items():
             if key not in tables:
-                lines.append(f"{quoted(key)} = {json.dumps(value, ensure_ascii=False)}")
+                moment = value.isoformat() if isinstance(value, datetime) else ""
+                lines.append(f"{quoted(key)} = {moment or json.dumps(value, ensure_ascii=False)}")
         for key, value in tables.items():
-            write((*path, key), value)
+            if isinstance(value, Mapping):
+                write((*path, key), value)
+                continue
+            for one in value:
+                write((*path, key), one, "[[{}]]")
 
     write((), table)
     return "\n".join(lines) + "\n"

@@ -1,6 +1,5 @@
 """The log of a simulated machine: encoder counts, volts of the force sensor, brake commands."""
 
-import json
 from typing import Any
 
 import numpy as np
@@ -8,6 +7,7 @@ import pandas as pd
 
 from bampipe.arrays import Array
 from bampipe.errors import InputError
+from bampipe.files import toml_text
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.system import System
 from bampipe.simulator.specimen import Config, Specimen, find_input_column
@@ -135,38 +135,29 @@ def format_session_file(
     session_id: str, device: Device, config: Config, trials: list[dict[str, str]]
 ) -> str:
     """Return the session file over the trials that `record_trial` made."""
-    lines = [
-        'schema = "bampipe.session/1"',
-        f"session_id = {json.dumps(session_id)}",
-        f"device = {json.dumps(config.device)}",
-        f"sample_rate_hz = {config.sample_rate!r}",
-        "simulated = true",
-        "",
-        "[encoders]",
-    ]
+    encoders = {}
     for c in device.coordinates:
         name, per_unit, zero = _encoder_settings(c)
-        entry = f'column = "{name}", counts_per_unit = {per_unit!r}, zero_counts = {zero}'
-        lines.append(f'{c.name} = {{ {entry}, unit = "{c.unit}" }}')
-    lines += ["", "[force]"]
+        scale = {"counts_per_unit": per_unit, "zero_counts": zero}
+        encoders[c.name] = {"column": name, **scale, "unit": c.unit}
+    force = {"columns": list(device.forces), "unit": device.force_unit}
     if device.force_unit == "N":
         calibration, zero_v = _force_calibration(len(device.forces))
-        lines += [
-            f"columns = {json.dumps([f'{f}_v' for f in device.forces])}",
-            'unit = "V"',
-            'frame = "handle"',
-            f"calibration_n_per_v = {json.dumps(calibration.tolist())}",
-            f"zero_v = {json.dumps(zero_v.tolist())}",
-        ]
-    else:
-        lines += [f"columns = {json.dumps(list(device.forces))}", f'unit = "{device.force_unit}"']
-    lines.append(f"noise_sd_n = {config.force_noise!r}")
-    if device.brakes:
-        units = ", ".join(device.coordinate(axis).torque_unit for axis in device.brakes)
-        names = json.dumps(list(device.brakes.values()))
-        lines += ["", "[brakes]", f"columns = {names}", f'unit = "{units}"']
-    for trial in trials:
-        lines += ["", "[[trials]]", *(f'{key} = "{value}"' for key, value in trial.items())]
-        if trial["kind"] == "viscous":
-            lines.append(f"viscous_n_s_per_m = {config.viscous_damping!r}")
-    return "\n".join(lines) + "\n"
+        force = {"columns": [f"{f}_v" for f in device.forces], "unit": "V", "frame": "handle"}
+        force |= {"calibration_n_per_v": calibration.tolist(), "zero_v": zero_v.tolist()}
+    units = ", ".join(device.coordinate(axis).torque_unit for axis in device.brakes)
+    brakes = {"columns": list(device.brakes.values()), "unit": units}
+    viscous = {"viscous_n_s_per_m": config.viscous_damping}
+    return toml_text(
+        {
+            "schema": "bampipe.session/1",
+            "session_id": session_id,
+            "device": config.device,
+            "sample_rate_hz": config.sample_rate,
+            "simulated": True,
+            "encoders": encoders,
+            "force": force | {"noise_sd_n": config.force_noise},
+            **({"brakes": brakes} if device.brakes else {}),
+            "trials": [one | (viscous if one["kind"] == "viscous" else {}) for one in trials],
+        }
+    )

@@ -2,13 +2,14 @@
 
 import copy
 import datetime
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+
+from bampipe.files import toml_text
 
 RATE = 500.0
 COUNTS = {"yaw": (21333.3333, 12000), "pitch": (10191.0828, -4000), "extension": (33333.3333, 3000)}
@@ -97,24 +98,6 @@ def csv_text(table: dict[str, np.ndarray], columns: tuple[str, ...] | None = Non
         cells = ["" if np.isnan(v) else f % v for f, v in zip(formats, row, strict=True)]
         lines.append(",".join(cells))
     return "\n".join(lines) + "\n"
-
-
-def toml_text(value: Any) -> str:
-    """A session table as TOML, inline below the first level."""
-
-    def inline(item: Any) -> str:
-        if isinstance(item, dict):
-            pairs = (f"{json.dumps(k)} = {inline(v)}" for k, v in item.items())
-            return "{ " + ", ".join(pairs) + " }"
-        if isinstance(item, list):
-            return "[" + ", ".join(inline(v) for v in item) + "]"
-        if isinstance(item, datetime.datetime):
-            return item.isoformat().replace("+00:00", "Z")
-        if isinstance(item, float):
-            return repr(item)
-        return json.dumps(item)
-
-    return "".join(f"{json.dumps(key)} = {inline(item)}\n" for key, item in value.items())
 
 
 def parquet(table: dict[str, np.ndarray]) -> bytes:

@@ -14,12 +14,12 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
-from made_session import COUNTS, SESSION, Made, free_trial, parquet, toml_text
+from made_session import COUNTS, SESSION, Made, free_trial, parquet
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
-from bampipe.files import read_json
+from bampipe.files import read_json, toml_text
 from bampipe.progress import silent
 from bampipe.run.settings import configure
 from bampipe.stages import ingest
