@@ -66,6 +66,23 @@ def read_json_table(path: Path) -> dict[str, Any]:
         raise
 
 
+def pick_values(content: object, dotted: str, key: str = "") -> dict[str, Any]:
+    """The values at a ``dotted`` place in tables; keys may hold dots themselves.
+
+    They are by the key that the last ``*`` of the place matches, or by ``key`` without one.
+    """
+    if not dotted:
+        return {key: content}
+    if not isinstance(content, Mapping):
+        return {}
+    if dotted.partition(".")[0] == "*":
+        parts = (pick_values(content[name], dotted[2:], name) for name in sorted(content))
+        return {name: value for part in parts for name, value in part.items()}
+    names = [name for name in content if f"{dotted}.".startswith(f"{name}.")]
+    longest = max(names, key=len, default="")
+    return pick_values(content[longest], dotted[len(longest) + 1 :], key) if names else {}
+
+
 def parse_json(data: bytes, where: str) -> Any:
     """The value that the bytes ``data`` of the JSON file ``where`` stand for."""
     try:

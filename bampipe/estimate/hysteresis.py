@@ -69,8 +69,8 @@ class Cycle:
     Attributes:
         start, stop: its first and last sample.
         stiffness: N.m/rad or N/m.
-        width_torque: height of the loop between its two straight sides, N.m or N.
-        width_deflection: its width in the other direction, rad or m.
+        loop_width: height of the loop between its two straight sides, N.m or N.
+        loop_width_deflection: its width in the other direction, rad or m.
         energy: lost in the cycle, J.
         amplitude: half the range of the torque, N.m or N.
         centre: deflection in the middle of the loop at zero torque, rad or m: a drift from cycle to
@@ -80,8 +80,8 @@ class Cycle:
     start: int
     stop: int
     stiffness: float
-    width_torque: float
-    width_deflection: float
+    loop_width: float
+    loop_width_deflection: float
     energy: float
     amplitude: float
     centre: float
@@ -308,8 +308,8 @@ def _measure_cycle(
     load, moved = torque[start : stop + 1], deflection[start : stop + 1]
     return Cycle(
         start=start, stop=stop, stiffness=1.0 / line.compliance,
-        width_torque=float(falling - rising) / line.compliance,
-        width_deflection=float(falling - rising),
+        loop_width=float(falling - rising) / line.compliance,
+        loop_width_deflection=float(falling - rising),
         energy=energy_lost(load, moved, 1.0 / line.compliance),
         amplitude=0.5 * float(np.ptp(load)), centre=float(0.5 * (falling + rising)),
     )  # fmt: skip

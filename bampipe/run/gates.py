@@ -1,31 +1,15 @@
 """Quality gates: results compared with the limits of a pipeline."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.pipeline import Gate
-from bampipe.files import read_json_table
+from bampipe.files import pick_values, read_json_table
 from bampipe.results.ingest import IngestResult
 from bampipe.results.run import GateState, GateVerdict
 from bampipe.run import accepted
-
-
-def _pick(content: object, dotted: str) -> dict[str, object]:
-    """Return the values at ``dotted``, by the key that its ``*`` matches ("" without one)."""
-    found: dict[str, object] = {"": content}
-    for part in dotted.split("."):
-        step: dict[str, object] = {}
-        for key, value in found.items():
-            if not isinstance(value, Mapping):
-                continue
-            if part == "*":
-                step.update({str(name): value[name] for name in sorted(value)})
-            elif part in value:
-                step[key] = value[part]
-        found = step
-    return found
 
 
 def _number(value: object) -> float | None:
@@ -72,9 +56,9 @@ def _judge_result(gate: Gate, root: Path, model: str) -> list[GateVerdict]:
     if not (root / relative).is_file():
         return [_missing(gate, "", f"there is no {relative}")]
     content = read_json_table(root / relative)
-    values = _pick(content, gate.value)
-    divisors = _pick(content, gate.divide_by) if gate.divide_by else {}
-    words = _pick(content, gate.judged_by) if gate.judged_by else {}
+    values = pick_values(content, gate.value)
+    divisors = pick_values(content, gate.divide_by) if gate.divide_by else {}
+    words = pick_values(content, gate.judged_by) if gate.judged_by else {}
     if not values:
         return [_missing(gate, "", f"{relative} has no {gate.value}")]
     verdicts = []
@@ -126,8 +110,8 @@ def _judge_change(
         return model, [found.model_copy(update={"state": "warned"}) if gate.optional else found]
     old = reference.results.get(gate.result, {})
     parent, _, last = gate.value.rpartition(".")
-    now, before = _pick(content, gate.value), _pick(old, gate.value)
-    sds, old_sds = (_pick(of, f"{parent}.sd") for of in (content, old))
+    now, before = pick_values(content, gate.value), pick_values(old, gate.value)
+    sds, old_sds = (pick_values(of, f"{parent}.sd") for of in (content, old))
     verdicts = []
     for key in now | before:
         value, accepted_value = _number(now.get(key)), _number(before.get(key))

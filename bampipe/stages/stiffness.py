@@ -315,9 +315,9 @@ def _axis(
         poses={
             name: dict(zip(system.coordinates, pose, strict=True)) for name, pose in poses.items()
         },
-        loop_width=float(np.mean([cycle.width_torque for _, cycle in cycles])),
+        loop_width=float(np.mean([cycle.loop_width for _, cycle in cycles])),
         loop_width_unit=system.torque_units[number],
-        loop_width_deflection=float(np.mean([cycle.width_deflection for _, cycle in cycles])),
+        loop_width_deflection=float(np.mean([cycle.loop_width_deflection for _, cycle in cycles])),
         loop_width_deflection_unit=system.coordinate_units[number],
         energy_per_cycle=float(np.mean([cycle.energy for _, cycle in cycles])),
         energy_unit="J",
@@ -327,8 +327,6 @@ def _axis(
                 cycle,
                 trial_id=trial.trial_id,
                 duration_s=(cycle.stop - cycle.start) / trial.rate,
-                loop_width=cycle.width_torque,
-                loop_width_deflection=cycle.width_deflection,
             )
             for trial, cycle in cycles
         ),

@@ -30,7 +30,7 @@ def test_stiffness_within_a_percent(kind: str, friction: float, slip: float) -> 
         assert found.yielded
         assert found.stiffness == pytest.approx(K, rel=0.01)
         assert len(found.cycles) == 3
-        widths = [cycle.width_torque for cycle in found.cycles]
+        widths = [cycle.loop_width for cycle in found.cycles]
         assert np.mean(widths) == pytest.approx(2 * friction * AMPLITUDE, rel=0.1)
 
 

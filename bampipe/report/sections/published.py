@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from bampipe.files import read_json_table
+from bampipe.files import pick_values, read_json_table
 from bampipe.report.document import Block, Callout, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import NONE, format_digits, format_unit, format_with_sd
@@ -77,16 +77,5 @@ def _read_number(results: Results, place: dict[str, Any], key: str) -> float | N
     if key not in place:
         return None
     path = results.root / place["file"].format(model=results.model)
-    value = _find(read_json_table(path) if path.is_file() else {}, place[key])
-    return None if value is None else float(place.get("factor", 1.0)) * value
-
-
-def _find(content: Any, dotted: str) -> float | None:
-    """Return the number at a dotted place; keys may hold dots themselves."""
-    if not isinstance(content, dict):
-        return float(content) if isinstance(content, int | float) and not dotted else None
-    keys = [key for key in content if f"{dotted}.".startswith(f"{key}.")]
-    if not keys:
-        return None
-    longest = max(keys, key=len)
-    return _find(content[longest], dotted[len(longest) + 1 :])
+    value = pick_values(read_json_table(path) if path.is_file() else {}, place[key]).get("")
+    return float(place.get("factor", 1.0)) * value if isinstance(value, int | float) else None
