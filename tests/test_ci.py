@@ -70,10 +70,10 @@ def test_parameters_are_held_against_those_accepted(tmp_path: Path) -> None:
     new = made(tmp_path / "runs/new", viscous__yaw=4.1, coulomb__yaw=2.2, mass=3.5)
     expected = {"coulomb.yaw": "failed", "viscous.yaw": "passed", "mass": "absent"}
     assert states(new, folder) == expected
-    found = gates.judge_gates(CHANGE, new, "base", folder)
+    found = gates.judge_gates(CHANGE, new, "base+x", folder)
     verdict = next(v for v in found if v.key == "coulomb.yaw")
     assert verdict.value == pytest.approx(10.0)
-    assert verdict.model == "base"
+    assert (verdict.state, verdict.model) == ("failed", "base"), "the model that was accepted"
     assert "2 to 2.2, +10 % ± 0.71 %, is beyond 5 %" in verdict.message
 
 
@@ -91,14 +91,6 @@ def test_a_change_passes_by_its_size_and_fails_where_it_is_sure(
     folder = tmp_path / "accepted"
     accepted.accept(made(tmp_path / "runs/old", sd=0.0, mass=2.0), "base", folder)
     assert states(made(tmp_path / "runs/a", sd=sd, mass=estimate), folder) == {"mass": state}
-
-
-def test_a_change_is_judged_of_the_model_that_was_accepted(tmp_path: Path) -> None:
-    folder = tmp_path / "accepted"
-    accepted.accept(made(tmp_path / "runs/old", mass=2.0), "base", folder)
-    new = made(tmp_path / "runs/new", mass=3.0)
-    found = gates.judge_gates(CHANGE, new, "base+x", folder)
-    assert [(v.model, v.state) for v in found] == [("base", "failed")]
 
 
 def test_accepted_values_of_another_model_do_not_count(tmp_path: Path) -> None:
@@ -203,8 +195,6 @@ def test_accept_refuses_what_failed(
     code, out, _ = command("accept", "s1", "--force")
     assert code == 0 and "accepted/bam.json" in out
     assert json.loads((tmp_path / "accepted/bam.json").read_text())["session"] == "s1"
-    code, _, err = command("accept", "s1", "--force", "--model", "base+snag")
-    assert code == 2 and "no model 'base+snag'" in err
 
 
 def test_the_summary_is_a_table_that_no_text_breaks(tmp_path: Path) -> None:
