@@ -113,13 +113,3 @@ class Pipeline(Declaration):
     def with_every_stage(self) -> Pipeline:
         """Return the pipeline for single stages: with its settings, but with every stage."""
         return self.model_copy(update={"stages": base.STAGES})
-
-    def content(self) -> dict[str, Any]:
-        """Return the pipeline's record in ``run.json``."""
-        return {
-            "name": self.name,
-            "stages": list(self.stages),
-            "device": self.model.device,
-            "effects": list(self.model.effects),
-            "settings": {stage: dict(values) for stage, values in self.settings.items()},
-        }

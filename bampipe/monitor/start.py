@@ -11,7 +11,7 @@ from bampipe.arrays import Array
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import Session, read_session
 from bampipe.data.stream import SampleStream, StreamLayout
-from bampipe.declarations.model_file import load_model
+from bampipe.declarations.model_file import load_model, read_estimate
 from bampipe.errors import InputError
 from bampipe.estimate.consistency import Reference, window_means
 from bampipe.estimate.square_root import FilterSettings
@@ -174,8 +174,7 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
             where=str(run.path(path)),
             remedy=f"bampipe identify {run.root} --set method=ukf",
         )
-    values, names = system.prior, found.covariance.names
-    values[[system.index(name) for name in names]] = [found.parameters[n].estimate for n in names]
+    values, names = read_estimate(run, name, system), found.covariance.names
     ingested = run.read(IngestResult)
     if ingested.kept_every > 1:
         raise InputError(

@@ -121,7 +121,7 @@ class _Runner:
         baseline = self.request.accepted or accepted.accepted_folder(self.root.parent)
         found = (judge_gates(gate, self.root, judged, baseline) for gate in pipeline.gates)
         verdicts = tuple(verdict for of_gate in found for verdict in of_gate)
-        used = PipelineUsed.model_validate(pipeline.content())
+        used = PipelineUsed.of(pipeline, pipeline.model)
         self.state.save(pipeline=used, gates=verdicts)
         return Outcome(self.root, "done", tuple(results), verdicts, model=judged)
 
