@@ -8,7 +8,6 @@ import typer
 from bampipe.cli import show
 from bampipe.cli.one_stage import parse_settings
 from bampipe.cli.options import JsonOption, QuietOption
-from bampipe.errors import InputError
 
 
 def init(
@@ -108,25 +107,21 @@ def simulate(
     batch.limit_threads(1)
     from bampipe.simulator.simulated_session import Config, simulate_session
 
-    parameters: dict[str, float] = {}
-    for key, value in parse_settings(settings).items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(f"--set {key} needs a number, not {value!r}")
-        parameters[key] = float(value)
-    config = Config(
-        effects=tuple(effect or ()),
-        strength=strength,
-        seed=seed,
-        device=device,
-        effect_files=tuple(effect_file or ()),
-        trials=trials,
-        viscous_trials=viscous_trials,
-        locked_trials=locked_trials,
-        duration=duration,
-        sample_rate=sample_rate,
-        parameters=parameters,
-        file_format=file_format,
-    )
+    given = {
+        "effects": effect or (),
+        "strength": strength,
+        "seed": seed,
+        "device": device,
+        "effect_files": effect_file or (),
+        "trials": trials,
+        "viscous_trials": viscous_trials,
+        "locked_trials": locked_trials,
+        "duration": duration,
+        "sample_rate": sample_rate,
+        "parameters": parse_settings(settings),
+        "file_format": file_format,
+    }
+    config = Config.read(given)
     with show.Watcher(quiet or json) as watcher:
         content = simulate_session(out, config, watcher.follow(out.name, "simulate"))
     if json:

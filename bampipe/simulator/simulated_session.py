@@ -6,7 +6,6 @@ session folder, never inside.
 """
 
 import re
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +38,6 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
     Raises:
         InputError: an effect, parameter or option makes no sense, or ``out`` is not empty.
     """
-    _check(config)
     out = Path(out).resolve()
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", out.name):
         raise InputError(
@@ -72,7 +70,7 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
         schema="bampipe.truth/1",
         device=specimen.device.name,
         effects=strengths,
-        configuration=asdict(config),
+        configuration=config.model_dump(),
         parameters=dict(specimen.values),
         stiffness=dict(specimen.stiffness) if config.locked_trials else {},
     )
@@ -85,23 +83,6 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
         "effects": list(strengths),
         "trials": [trial["file"] for trial in trials],
     }
-
-
-def _check(config: Config) -> None:
-    for name in ("duration", "sample_rate", "amplitude", "viscous_damping"):
-        if not 0 < getattr(config, name) < float("inf"):
-            raise InputError(f"{name} must be positive, found {getattr(config, name)!r}")
-    for name in ("strength", "force_noise", "trials", "viscous_trials", "seed"):
-        if not 0 <= getattr(config, name) < float("inf"):
-            raise InputError(f"{name} must not be negative, found {getattr(config, name)!r}")
-    if config.amplitude > 1:
-        raise InputError(f"amplitude must be at most 1, found {config.amplitude}")
-    if config.trials + config.viscous_trials == 0 and not config.locked_trials:
-        raise InputError("nothing to simulate", remedy="ask for at least one trial")
-    if config.duration * config.sample_rate < 10:
-        raise InputError("a trial would have fewer than 10 samples", remedy="make it longer")
-    if config.file_format not in ("csv", "parquet"):
-        raise InputError(f"file format {config.file_format!r} is neither csv nor parquet")
 
 
 def _list_trials(device: Device, config: Config) -> list[dict[str, str]]:

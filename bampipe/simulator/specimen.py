@@ -1,10 +1,12 @@
 """The specimen of a device, with hidden effects, that a simulated session records."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal, Self
 
 import numpy as np
+from pydantic import Field
 
 from bampipe.arrays import Array
 from bampipe.errors import InputError, did_you_mean
@@ -13,13 +15,13 @@ from bampipe.physics import Model, registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import BoundEffect
 from bampipe.physics.system import System, compile_model
+from bampipe.schema import Count, Declaration, NotNegative, Number, Positive, Several, read
 
 STIFFNESS = {"rotary": 2200.0, "linear": 109e3}
 """Typical transmission stiffness (Table I), N.m/rad and N/m."""
 
 
-@dataclass(frozen=True)
-class Config:
+class Config(Declaration):
     """Settings of a simulation.
 
     Attributes:
@@ -42,21 +44,32 @@ class Config:
         file_format: of the trial files, ``csv`` or ``parquet``.
     """
 
-    effects: tuple[str, ...] = ()
-    strength: float = 1.0
-    seed: int = 0
+    effects: Several[str] = ()
+    strength: NotNegative = 1.0
+    seed: Count = 0
     device: str = "bam"
-    effect_files: tuple[str, ...] = ()
-    trials: int = 5
-    viscous_trials: int = 0
+    effect_files: Several[str] = ()
+    trials: Count = 5
+    viscous_trials: Count = 0
     locked_trials: bool = False
-    duration: float = 16.0
-    sample_rate: float = 500.0
-    viscous_damping: float = 40.0
-    amplitude: float = 1.0
-    force_noise: float = 0.05
-    parameters: Mapping[str, float] = field(default_factory=dict)
-    file_format: str = "csv"
+    duration: Positive = 16.0
+    sample_rate: Positive = 500.0
+    viscous_damping: Positive = 40.0
+    amplitude: Annotated[Positive, Field(le=1)] = 1.0
+    force_noise: NotNegative = 0.05
+    parameters: dict[str, Number] = Field(default={})
+    file_format: Literal["csv", "parquet"] = "csv"
+
+    @classmethod
+    def read(cls, given: Mapping[str, object]) -> Self:
+        """Return the settings ``given``; `InputError` names each that is wrong."""
+        return read(cls, given, "")
+
+    def cross_faults(self) -> Iterator[InputError]:
+        if self.trials + self.viscous_trials == 0 and not self.locked_trials:
+            yield InputError("nothing to simulate", remedy="ask for at least one trial")
+        if self.duration * self.sample_rate < 10:
+            yield InputError("a trial would have fewer than 10 samples", remedy="make it longer")
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ SAMPLES = Path(__file__).parents[2] / "sample_runs"
 
 def make(tmp_path, **options):
     out = tmp_path / "made"
-    summary = simulate_session(out, Config(**options))
+    summary = simulate_session(out, Config.read(options))
     return out, json.loads((tmp_path / "made.truth.json").read_text()), summary
 
 
@@ -243,11 +243,11 @@ def test_own_effect_file(tmp_path):
         ({"device": "magnetic_damper"}, "it takes current, and only forces are simulated"),
         ({"device": "servo_pendulum"}, "it takes duty and supply, and only forces"),
         ({"trials": 0}, "nothing to simulate"),
-        ({"duration": 0.0}, "duration must be positive"),
+        ({"duration": 0.0}, "duration: found 0.0, expected more than 0"),
         ({"duration": 0.001}, "fewer than 10 samples"),
-        ({"amplitude": 3.0}, "at most 1"),
-        ({"strength": -1.0}, "strength must not be negative"),
-        ({"file_format": "xls"}, "neither csv nor parquet"),
+        ({"amplitude": 3.0}, "amplitude: found 3.0, expected 1 or less"),
+        ({"strength": -1.0}, "strength: found -1.0, expected 0 or more"),
+        ({"file_format": "xls"}, 'found "xls", expected "csv" or "parquet"'),
         ({"parameters": {"viscos.yaw": 3.0}}, "no parameter 'viscos.yaw'"),
         ({"effect_files": ("nowhere.toml",)}, "nowhere.toml"),
     ],
