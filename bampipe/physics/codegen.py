@@ -146,7 +146,7 @@ def bodies_at_state(e: Equations) -> Bodies:
 def bodies_along_motion(e: Equations) -> Bodies:
     """``bodies(q, qd, qdd, p, out)``: the forces that a robot's bodies require, (T, names)."""
     names, block = _print_bodies(e, e.dynamics)
-    return names, _print_along_motion("bodies", _select_groups(e, "q qd qdd"), e.p, block)
+    return names, _print_along_motion("bodies", e.groups("q qd qdd"), e.p, block)
 
 
 def _print_along_motion(
@@ -250,15 +250,9 @@ def _print_over_columns(
 ) -> str:
     """Module of functions over columns: by name, their groups and what they return."""
     return ARRAY_HEADER + "".join(
-        function_source(name, _select_groups(e, groups), exprs, steps)
+        function_source(name, e.groups(groups), exprs, steps)
         for name, (groups, exprs) in results.items()
     )
-
-
-def _select_groups(e: Equations, names: str) -> dict[str, list[Any]]:
-    """Groups of symbols of ``e`` by their names, which spaces separate."""
-    groups = e.groups | {"w": e.w}
-    return {name: groups[name] for name in names.split()}
 
 
 def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
@@ -271,7 +265,7 @@ def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
         for i, by_axis in enumerate(e.dependence.lasting)
         for axis, slope in (by_axis or {}).items()
     }
-    groups = _select_groups(e, "q qd qdd u")
+    groups = e.groups("q qd qdd u")
     return ARRAY_HEADER + function_source("slopes", groups, [*by_place.values()]), [*by_place]
 
 
@@ -347,7 +341,7 @@ def _encoder_readings(e: Equations) -> list[Any]:
 
 def _encoder_groups(e: Equations) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
     """The arguments of the measurement, and its outputs."""
-    return {"x": [*e.q, *e.qd], **_select_groups(e, "u p")}, {"y": _encoder_readings(e)}
+    return {"x": [*e.q, *e.qd], **e.groups("u p")}, {"y": _encoder_readings(e)}
 
 
 def _print_motion(e: Equations, index: str = "{}", known: Sequence[Any] = ()) -> list[str]:
@@ -362,7 +356,7 @@ def _print_motion(e: Equations, index: str = "{}", known: Sequence[Any] = ()) ->
     results = [*_upper_entries(e), *force, *e.rates]
     block = print_block([*results, *e.qd], e.steps, known)
     values = block.values[: len(results)]
-    groups = {"x": [*e.q, *e.qd, *e.z], **_select_groups(e, "u p w")}
+    groups = {"x": [*e.q, *e.qd, *e.z], **e.groups("u p w")}
     body = unpack_groups(groups, block.used, index)
     # A comma after each name also unpacks a single one from its tuple.
     body += [f"{', '.join(map(str, known))}, = bodies(x, p)"] if known else []
@@ -436,5 +430,5 @@ def residual_source(e: Equations, bodies: Sequence[Any]) -> str:
         e: the equations; bodies: names of what ``b`` holds, by `bodies_along_motion`.
     """
     block = print_block(e.residual, e.steps, bodies)
-    groups = {**_select_groups(e, "q qd qdd"), "b": bodies, **_select_groups(e, "z u")}
+    groups = {**e.groups("q qd qdd"), "b": bodies, **e.groups("z u")}
     return _print_along_motion("residual", groups, e.p, block)

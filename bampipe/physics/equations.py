@@ -84,11 +84,10 @@ class Equations:
     compensation: list[Any]
     delays: list[str]
 
-    @property
-    def groups(self) -> dict[str, list[Any]]:
-        """Arguments of functions over columns, by name: states are followed by their `changes`."""
-        states = [*self.z, *self.changes.values()]
-        return {"q": self.q, "qd": self.qd, "qdd": self.qdd, "z": states, "u": self.u, "p": self.p}
+    def groups(self, names: str) -> dict[str, list[Any]]:
+        """Symbols by argument of a function, ``names`` between spaces; `changes` follow ``z``."""
+        found = {name: getattr(self, name) for name in names.split()}
+        return found | ({"z": [*self.z, *self.changes.values()]} if "z" in found else {})
 
     @property
     def other_now(self) -> list[Any]:

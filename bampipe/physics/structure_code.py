@@ -137,4 +137,4 @@ def _print_slopes(model: Model, e: Equations, pivots: Sequence[str]) -> str:
         constant_symbol(name): sp.Float(c.value) for name, c in model.device.constants.items()
     }
     slopes = [sp.diff(r, constant_symbol(n)).subs(numbers) for r in e.residual for n in pivots]
-    return function_source("slopes", e.groups, slopes, e.steps)
+    return function_source("slopes", e.groups("q qd qdd z u p"), slopes, e.steps)
