@@ -260,26 +260,30 @@ def _cancel_residual(fitted: ModelOnTrial) -> Array:
     """Change the measured force by Newton steps until no residual is left, (T, n_f).
 
     An effect that takes a part of the force requires more of it. A force that acts through an
-    internal state, such as a lag, has no instantaneous slope; one is assumed.
+    internal state, such as a lag, has no instantaneous slope; one is assumed. What no force can
+    cancel stays, as where a gap is crossed.
     """
     system, motion, p = fitted.system, fitted.motion, fitted.p
     columns = force_columns(system)
-    u, first = motion.inputs(system.inputs).copy(), 0.0
-    for number in range(_CORRECTIONS):
+    u = kept = motion.inputs(system.inputs).copy()
+    first, least = 0.0, np.inf
+    for _ in range(_CORRECTIONS):
         at = motion.of_mechanism(system, u, p).kinematics
         z = system.memory(*at, u, p, motion.t)
         left = system.residual(*at, z, u, p)
         size = float(np.sqrt(np.mean(left**2)))
-        first = first or size
-        if number and size <= _CANCELLED * first:
+        if not size < least:
             break
-        moved = u.copy()
+        kept, least, first = u, size, first or size
+        if size <= _CANCELLED * first:
+            break
+        u, moved = u.copy(), u.copy()
         moved[:, columns] -= _SMALL * system.least_force(motion.q, left, u, p)
         slope = (left - system.residual(*at, z, moved, p)) / _SMALL
         steep = np.abs(slope) > _LEAST_SLOPE * np.abs(left)
         share = np.divide(left, slope, out=np.ones_like(left), where=steep)
         u[:, columns] -= system.least_force(motion.q, share * left, u, p)
-    return u[:, columns]
+    return kept[:, columns]
 
 
 def _without_delays(system: System, p: Array) -> Array:
