@@ -1,7 +1,7 @@
 """One recording: a log, one of several in a file, or several files joined; and a sound trial."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,7 +90,16 @@ def read_recording(
 def _without_codes(raw: RawTrial, clock: Clock) -> RawTrial:
     """The readings without a number that stands for none, such as -9999: the same one, far off."""
     columns, notes = dict(raw.columns), list(raw.notes)
-    for name in columns.keys() - {clock.column, clock.nanoseconds}:
+    names = sorted(columns.keys() - {clock.column, clock.nanoseconds})
+    zero = np.all([columns[name] == 0.0 for name in names], axis=0)
+    if (
+        len(names) > 1
+        and 0 < zero.sum() < zero.size
+        and all(_leaps(columns[n], zero) for n in names)
+    ):
+        columns |= {name: np.where(zero, np.nan, columns[name]) for name in names}
+        notes.append(f"{zero.sum()} rows of zeros, to which all readings leap, are taken for none")
+    for name in names:
         for side in (-1.0, 1.0):
             values = columns[name]
             code = side * float(np.max(side * values, initial=-np.inf, where=np.isfinite(values)))
@@ -103,6 +112,13 @@ def _without_codes(raw: RawTrial, clock: Clock) -> RawTrial:
                 columns[name] = np.where(values == code, np.nan, values)
                 notes.append(f"column '{name}': {count} readings of {code:g} are taken for none")
     return replace(raw, columns=columns, notes=tuple(notes))
+
+
+@np.errstate(invalid="ignore")
+def _leaps(values: np.ndarray, where: np.ndarray) -> bool:
+    """Whether readings (T,) leap where rows ``where`` (T,) begin and end, and rarely elsewhere."""
+    steps, ends = np.abs(np.diff(values)), np.diff(where)
+    return bool(np.nanmedian(steps[ends]) > _FAR_OFF * np.nanmedian(steps[~ends & ~where[1:]]))
 
 
 def _filled(raw: RawTrial, clock: Clock) -> RawTrial:
@@ -296,12 +312,11 @@ def find_copies(session: Session) -> dict[str, str]:
     return reasons
 
 
-def describe_spans(spans: Mapping[str, Mapping[str, float]]) -> list[str]:
+def describe_spans(spans: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
     """Sentences on trials in which an axis goes as much farther as another unit would make it.
 
     ``spans``: what each axis covers, by name of the trial and of the axis.
     """
-    said = []
     for name, own in spans.items():
         for axis, span in own.items():
             others = [other[axis] for trial, other in spans.items() if trial != name]
@@ -309,8 +324,7 @@ def describe_spans(spans: Mapping[str, Mapping[str, float]]) -> list[str]:
             size = max(ratio, 1.0 / max(ratio, 1e-300))
             if any(low < size < 2.0 * low for low in (40.0, 700.0)):
                 much = f"{ratio:.3g} times as far as in the others"
-                said.append(f"{name}: {axis} goes {much}: is it logged in another unit?")
-    return said
+                yield f"{name}: {axis} goes {much}: is it logged in another unit?"
 
 
 def read_sound_trial(

@@ -63,21 +63,14 @@ class StreamLayout:
                 where=f"{where}: time",
                 remedy="write seconds, or microseconds as time_us",
             )
-        rates = [encoder.name for encoder in session.encoders if encoder.integrate]
-        if rates:
-            raise InputError(
-                f"axis {rates[0]} has a velocity and no position, which a stream cannot do without",
-                where=where,
-                remedy="log the position",
-            )
+        for rate in (encoder.name for encoder in session.encoders if encoder.integrate):
+            what = f"axis {rate} has a velocity and no position, which a stream cannot do without"
+            raise InputError(what, where=where, remedy="log the position")
         registers = [encoder.name for encoder in session.encoders if encoder.sign_bit]
         registers += [c.name for c in session.channels if c.sign_bit or c.wrap_bits]
-        if registers:
-            raise InputError(
-                f"{registers[0]} is a register that holds a sign, which a stream cannot undo",
-                where=where,
-                remedy="log it as a signed number",
-            )
+        for register in registers:
+            what = f"{register} is a register that holds a sign, which a stream cannot undo"
+            raise InputError(what, where=where, remedy="log it as a signed number")
         known = [(clock.column, "t", session.tick, 0.0)]
         known += [(e.column, f"q_{e.name}", e.scale, -e.zero * e.scale) for e in session.encoders]
         known += [(b.column, f"brake_{b.axis}", 1.0, 0.0) for b in session.brakes]

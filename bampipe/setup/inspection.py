@@ -121,19 +121,17 @@ def inspect_setup(
     )
 
 
-def _describe_travel(system: System, session: IngestResult, motions: Sequence[Motion]) -> list[str]:
+def _describe_travel(
+    system: System, session: IngestResult, motions: Sequence[Motion]
+) -> Iterator[str]:
     """Report axes that move implausibly far, as if degrees were taken for radians unstated."""
     travel = np.max([np.ptp(motion.q, axis=0) for motion in motions], axis=0)
-    found = []
     for coordinate, size in zip(system.model.device.coordinates, travel, strict=True):
         most, meant = _FARTHEST[coordinate.kind]
         axis = session.axes[coordinate.name]
         if size > most and axis.raw_unit == coordinate.unit and not axis.unit_in_log:
-            found.append(
-                f"{coordinate.name} moves through {size:.3g} {coordinate.unit}: is its position in"
-                f" {meant}?"
-            )
-    return found
+            said = f"{coordinate.name} moves through {size:.3g} {coordinate.unit}"
+            yield f"{said}: is its position in {meant}?"
 
 
 def _axis(

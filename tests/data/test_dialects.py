@@ -226,6 +226,8 @@ def test_recordings_and_chatter_are_found_with_their_rows(tmp_path):
     second = trial.between(40, 80)
     check(second)
     assert second.first_row == 44 and second.begun == ()
+    trial = read(tmp_path, table() + "0.400,1.0,2,reset alarm, door\n" + "0.410,1.0,2\n")
+    assert len(trial) == 41 and trial.notes == ("row 42 ends in words: left out",)
     with pytest.raises(InputError, match="50 lines hold text and no sample, and there are more"):
         read(tmp_path, table() + "oops\n0,1,2\n" * 60)
     with pytest.raises(InputError, match=r"row 42: 2 cells, where the header has 3; the line is"):

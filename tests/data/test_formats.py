@@ -1,15 +1,18 @@
 """HDF5, JSON, TDMS, ROS bags and MCAP: files that the libraries of their makers wrote."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 import scipy.io
 from binary_logs import write_mcap
+from pyarrow import feather
 
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.errors import InputError
@@ -48,6 +51,8 @@ def hdf5(tmp_path) -> Path:
         file["soft"] = h5py.SoftLink("/log/t")
         file["far"] = h5py.ExternalLink("/etc/passwd", "/")
         file["short"] = T[:-1]
+        file["packed"] = np.rint((Q - 0.5) / 1e-4).astype("i2")
+        file["packed"].attrs.update(scale_factor=1e-4, add_offset=0.5, units="rad")
         file["when"] = [f"2026-10-03T10:12:00.{n:02}0" for n in range(50)]
     return path
 
@@ -61,9 +66,9 @@ def test_hdf5(hdf5):
     found = columns_of(hdf5)
     assert found["log/force"] == "N" and {*columns, "log/pose[0]", "log/pose[2]"} <= set(found)
     assert not {"soft", "far", "log/text"} & set(found)
-    np.testing.assert_array_equal(
-        read_trial(hdf5, ("when", "log/t"), datetimes={"when": ""}).columns["when"], T
-    )
+    trial = read_trial(hdf5, ("when", "packed"), datetimes={"when": ""})
+    np.testing.assert_array_equal(trial.columns["when"], T)
+    np.testing.assert_allclose(trial.columns["packed"], Q, atol=6e-5)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +125,6 @@ def test_fields_of_matlab_structs(tmp_path, compressed):
     joined = read_trial(tmp_path / "runs.mat", ("runs[:].t", "runs[:].q"))
     assert joined.begun == (len(T),) and len(joined) == len(T) + 9
     np.testing.assert_array_equal(joined.columns["runs[:].q"], np.concatenate([Q, Q[:9]]))
-    scipy.io.savemat(path, content, do_compression=compressed)
     assert "not numbers" in refused(path, ("log.time", "log.name"))
     assert "did you mean 'log.axis.q'" in refused(path, ("log.time", "log.axis.qq"))
     with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:
@@ -133,18 +137,6 @@ def test_fields_of_matlab_structs(tmp_path, compressed):
     with path.open("ab") as file:
         file.write(b"\x0e\0\0\0" + len(body).to_bytes(4, "little") + body)
     assert list(columns_of(path)) == ["q", "tau", "scale"]
-    scipy.io.savemat(path, content, do_compression=compressed)
-    sound = path.read_bytes()
-    rng = np.random.default_rng(4)
-    for _ in range(200):  # a damaged file is refused or read, in one line, whatever it says
-        damaged = bytearray(sound)
-        for place in rng.integers(128, len(sound), 3):
-            damaged[place] = rng.integers(256)
-        path.write_bytes(bytes(damaged))
-        try:
-            read_trial(path, ("log.axis.q",))
-        except InputError as error:
-            assert "\n" not in str(error)
 
 
 # JSON
@@ -228,10 +220,11 @@ def test_tdms_refused(tdms):
 # Workbooks
 
 
-def test_the_first_sheet_with_rows_of_a_workbook_is_read(tmp_path):
+def test_the_sheet_with_most_rows_of_a_workbook_is_read(tmp_path):
     openpyxl = pytest.importorskip("openpyxl")
     book = openpyxl.Workbook()
     book.active.append(["notes of the day"])
+    book.active.append(["by K. M."])
     sheet = book.create_sheet("log")
     sheet.append(["Time [s]", "Force [N]"])
     for row in zip(T, F, strict=True):
@@ -476,8 +469,13 @@ def test_units_in_names_and_beside_the_columns_are_heard_in_every_format(tmp_pat
         file["log"] = frame.to_records(index=False)
         file["log"].attrs["units"] = ["", "", "deg"]
     scipy.io.savemat(tmp_path / "e.mat", {"log": {"q": Q, "units": units}})
+    feather.write_feather(pq.read_table(tmp_path / "a.parquet"), tmp_path / "f.feather")
+    shutil.copy(tmp_path / "d.h5", tmp_path / "g.nc")
     units |= {"t [ms]": "ms", "f (mN.m)": "mN.m"}
     for path in tmp_path.iterdir():
         found = {x.removeprefix("log."): unit for x, unit in columns_of(path).items()}
         assert units.items() >= found.items() and found["q"] == "deg"
-    assert read_trial(tmp_path / "a.parquet", ("t [ms]",)).units == {"t [ms]": "ms"}
+    for name in ("a.parquet", "f.feather"):
+        trial = read_trial(tmp_path / name, ("t [ms]", "q"))
+        assert trial.units == {"t [ms]": "ms", "q": "deg"}
+        np.testing.assert_array_equal(trial.columns["q"], Q)

@@ -124,8 +124,7 @@ def test_state_action_and_current_are_told_apart(tmp_path, version):
     assert [c.name for c in found.of("position")] == [f"observation.state.{j}" for j in JOINTS]
     assert [c.name for c in found.of("reference")] == [f"action.{j}" for j in JOINTS]
     assert [c.name for c in found.of("current")] == [f"observation.current[{k}]" for k in (0, 1)]
-    assert len(found.trials) == 5
-    assert found.passed == ()
+    assert len(found.trials) == 5 and found.passed == ()
 
 
 def test_a_data_set_without_a_drive_is_refused_with_what_can_be_found(tmp_path):
@@ -135,11 +134,8 @@ def test_a_data_set_without_a_drive_is_refused_with_what_can_be_found(tmp_path):
         propose(tmp_path)
     assert "shoulder_pan.pos 0.10 s, as a first-order lag of 1.6 Hz" in str(error.value)
     page = Path(__file__).parents[2] / "docs/raw_log_format.md"
-    (servo,) = (
-        text
-        for text in re.findall(r"```toml\n(.*?)```", page.read_text(), re.S)
-        if 'name = "servo"' in text
-    )
+    tables = re.findall(r"```toml\n(.*?)```", page.read_text(), re.S)
+    (servo,) = (table for table in tables if 'name = "servo"' in table)
     (tmp_path / "servo.toml").write_text(servo.replace("elbow", "elbow_flex"))
     proposed = propose(tmp_path, "servo.toml")
     assert proposed.fill_in[0].startswith("the column of goal")
@@ -153,9 +149,8 @@ def test_episodes_that_are_not_there_are_refused(tmp_path, asked, said):
     write_dataset(tmp_path, make_episodes(), NAMES)
     with pytest.raises(InputError, match=said):
         propose(tmp_path, episodes=asked)
-    other = tmp_path / "data"
     with pytest.raises(InputError, match="no data set of LeRobot"):
-        propose(other, episodes="0:2")
+        propose(tmp_path / "data", episodes="0:2")
 
 
 def test_init_and_ingest_take_the_episodes_of_a_data_set(tmp_path, command, monkeypatch):

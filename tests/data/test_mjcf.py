@@ -66,9 +66,7 @@ def test_the_dynamics_are_those_of_mujoco(tmp_path: Path, angles) -> None:
     system = compile_model(Model(device_from(read_device_file(write(tmp_path, text)))))
     assert system.coordinates == ("lift", "bend", "reach")
     p = system.prior
-    for i, item in enumerate(system.parameters):
-        if not item.name.startswith(("mass", "first", "inertia")):
-            p[i] = 0.0
+    p[[not x.name.startswith(("mass", "first", "inertia")) for x in system.parameters]] = 0.0
     q, qd, qdd = np.array([motion for motion, _ in MUJOCO]).swapaxes(0, 1)
     u, z = np.zeros((2, len(system.inputs))), np.zeros((2, 0))
     forces = system.required(q, qd, qdd, z, u, p)

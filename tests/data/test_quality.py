@@ -207,18 +207,11 @@ def test_what_comes_through_is_sound_and_what_changed_is_said(damages, length, k
     for name, start, size, how in damages:
         part = slice(start, start + size)
         values = table[name]
-        if how in ("nan", "inf"):
-            values[part] = float(how)
-        elif how == "zero":
-            values[part] = 0.0
-        elif how == "hold":
-            values[part] = values[start]
-        elif how == "jump":
+        put = {"nan": np.nan, "inf": np.inf, "zero": 0.0, "hold": values[start], "huge": 1e300}
+        if how == "jump":
             values[start:] += 30_000
-        elif how == "flip":
-            values[part] = values[part][::-1].copy()
         else:
-            values[part] = 1e300
+            values[part] = put.get(how, values[part][::-1].copy())  # "flip"
     table = {name: values[:length] for name, values in table.items()}
     try:
         trial = cleaned(table, kind)

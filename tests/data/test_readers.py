@@ -15,7 +15,7 @@ import scipy.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bampipe.data.readers import parquet, read_trial
+from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.readers import text as text_reader
 from bampipe.errors import InputError
 
@@ -53,29 +53,20 @@ def as_mat73(table, userblock=512):
     return b"MATLAB 7.3 MAT-file"[:userblock].ljust(userblock) + content[userblock:]
 
 
-WHOLE = {
-    "a.csv": as_csv(TABLE),
-    "b.parquet": pd.DataFrame(TABLE).to_parquet(),
-    "c.mat": as_mat(TABLE),
-    "d.mat": as_mat(TABLE, do_compression=True),
-    "e.mat": as_mat73(TABLE),
-}
+KINDS = [
+    ("a.csv", as_csv(TABLE)),
+    ("A.CSV", as_csv(TABLE)),
+    ("a.csv.gz", gzip.compress(as_csv(TABLE))),
+    ("a.parquet", pd.DataFrame(TABLE).to_parquet()),
+    ("b.parquet", pd.DataFrame(TABLE).astype("float32").to_parquet()),
+    ("a.mat", as_mat(TABLE | {"log": {"q": np.arange(3.0), "who": "x"}}, oned_as="row")),
+    ("b.mat", as_mat(TABLE, oned_as="column", do_compression=True)),
+    ("c.mat", as_mat73(TABLE)),
+    ("d.mat", as_mat73(TABLE, userblock=0)),
+]
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("a.csv", as_csv(TABLE)),
-        ("A.CSV", as_csv(TABLE)),
-        ("a.csv.gz", gzip.compress(as_csv(TABLE))),
-        ("a.parquet", pd.DataFrame(TABLE).to_parquet()),
-        ("a.parquet", pd.DataFrame(TABLE).astype("float32").to_parquet()),
-        ("a.mat", as_mat(TABLE, oned_as="row")),
-        ("a.mat", as_mat(TABLE, oned_as="column", do_compression=True)),
-        ("a.mat", as_mat73(TABLE)),
-        ("a.mat", as_mat73(TABLE, userblock=0)),
-    ],
-)
+@pytest.mark.parametrize(("name", "content"), KINDS)
 def test_all_kinds_of_file_give_the_same_numbers(tmp_path, name, content):
     trial = read(tmp_path / name, content)
     assert list(trial.columns) == list(TABLE) and trial.notes == ()
@@ -97,9 +88,11 @@ def test_empty_cells_and_words_for_missing_are_nan(tmp_path):
 
 def test_many_blocks_are_joined_in_order(tmp_path, monkeypatch):
     monkeypatch.setattr(text_reader, "BLOCK", 1024)
-    monkeypatch.setattr(parquet, "BATCH_ROWS", 100)
     table = {"a": np.arange(5000), "b": np.arange(5000) * 0.5}
-    files = {"a.csv": as_csv(table), "a.parquet": pd.DataFrame(table).to_parquet()}
+    files = {
+        "a.csv": as_csv(table),
+        "a.parquet": pd.DataFrame(table).to_parquet(row_group_size=100),
+    }
     for name, content in files.items():
         columns = read(tmp_path / name, content, ("b", "a")).columns
         np.testing.assert_array_equal(columns["a"], table["a"])
@@ -137,10 +130,10 @@ def test_a_last_line_that_may_be_cut_off_is_dropped_and_said(tmp_path, content, 
     assert trial.notes == (("last line is cut off: 1 row dropped",) if said else ())
 
 
-@pytest.mark.parametrize("name", WHOLE)
-def test_a_trial_that_is_too_large_is_refused(tmp_path, name):
+@pytest.mark.parametrize(("name", "content"), KINDS)
+def test_a_trial_that_is_too_large_is_refused(tmp_path, name, content):
     with pytest.raises(InputError, match="are more than the 0 MB allowed"):
-        read(tmp_path / name, WHOLE[name], largest_bytes=100)
+        read(tmp_path / name, content, largest_bytes=100)
 
 
 CELLS = st.one_of(
@@ -163,10 +156,10 @@ def test_any_bytes_are_refused_in_one_line(content, ending):
     check_reads_or_refuses(f"a{ending}", content, ("a", "b"))
 
 
-@settings(QUICK, max_examples=300)
-@given(st.sampled_from(sorted(WHOLE)), st.data())
-def test_a_file_with_bytes_changed_reads_or_is_refused_in_one_line(name, data):
-    content = bytearray(WHOLE[name])
+@settings(QUICK, max_examples=600)
+@given(st.sampled_from(KINDS), st.data())
+def test_a_file_with_bytes_changed_reads_or_is_refused_in_one_line(kind, data):
+    name, content = kind[0], bytearray(kind[1])
     for _ in range(data.draw(st.integers(1, 4))):
         place = data.draw(st.integers(0, len(content) - 1))
         content[place] = data.draw(st.integers(0, 255))
@@ -207,6 +200,10 @@ def test_samples_that_are_json_objects(tmp_path, text, name):
     trial = read_json(tmp_path, text, ("on", "gain"))
     np.testing.assert_array_equal(trial.columns["on"], [1.0, 0.0])
     np.testing.assert_array_equal(trial.columns["gain"], [2.0, 2.0])
+    text = '{"e": "start", "t": 0}\n{"t": 1, "q": {"x": 2}}\n'  # records of several kinds
+    trial = read_json(tmp_path, text, ("t", "q.x"), "b.jsonl")
+    np.testing.assert_array_equal(trial.columns["q.x"], [np.nan, 2.0])
+    assert list(columns_of(tmp_path / "b.jsonl")) == ["t", "q.x"]
 
 
 @pytest.mark.parametrize(

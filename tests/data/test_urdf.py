@@ -168,9 +168,7 @@ def test_what_cannot_be_computed_is_one_line(
     assert not caught.value.others and "\n" not in str(caught.value)
 
 
-def test_limits_below_zero_are_not_known_and_no_urdf_lies_outside_the_folder(
-    tmp_path: Path,
-) -> None:
+def test_limits_below_zero_are_unknown_and_no_urdf_lies_outside_the_folder(tmp_path: Path) -> None:
     parts = (link("a"), link("b"), joint("j", "a", "b"))
     parts = tuple(part.replace('effort="40"', 'effort="-40"') for part in parts)
     device = device_of(tmp_path, parts=parts)
@@ -280,12 +278,7 @@ TILT = """<joint name="{name}" type="{kind}"><origin xyz="0 0 1" rpy="{rpy}"/>
     ],
 )
 def test_gravity_is_that_of_the_root_above_the_base(
-    tmp_path: Path,
-    kind: str,
-    rpy: str,
-    axis: str,
-    gravity: tuple[float, float, float] | None,
-    said: str,
+    tmp_path: Path, kind: str, rpy: str, axis: str, gravity: tuple[float, ...] | None, said: str
 ) -> None:
     mount = TILT.format(name="mount", kind=kind, rpy=rpy, axis=axis)
     chain = read_chain(write(tmp_path, *ARM, '<link name="world"/>', mount), base="base")
@@ -312,10 +305,8 @@ def test_a_session_depends_on_its_urdf(tmp_path: Path) -> None:
 def test_an_encoder_that_reads_two_joints_gives_the_position_of_its_own() -> None:
     from bampipe.data.quality.channels import part_readings
 
-    encoders = [
-        SimpleNamespace(name="one", also_reads={}),
-        SimpleNamespace(name="two", also_reads={"one": 1.0}),
-    ]
+    reads = {"one": {}, "two": {"one": 1.0}}
+    encoders = [SimpleNamespace(name=name, also_reads=also) for name, also in reads.items()]
     si = {"q_one": np.array([0.1, 0.2]), "q_two": np.array([0.4, 0.7])}
     part_readings(SimpleNamespace(encoders=encoders), si)  # type: ignore[arg-type]
     np.testing.assert_allclose(si["q_one"], [0.1, 0.2])
@@ -347,12 +338,8 @@ def test_a_joint_that_follows_another_moves_with_it(tmp_path: Path) -> None:
     moves = np.array([[1.0, 0.0], [-0.5, 0.0], [0.0, 1.0]])
     q, qd, qdd = np.random.default_rng(0).normal(size=(3, 20, 2))
     for system, by in ((held, np.eye(2)), (free, moves)):
-        p = np.array(
-            [
-                0.0 if x.name.startswith(("visc", "coul", "rotor")) else x.prior
-                for x in system.parameters
-            ]
-        )
+        p = system.prior
+        p[[x.name.startswith(("visc", "coul", "rotor")) for x in system.parameters]] = 0.0
         at = q @ by.T + (np.array([0.0, 0.3, 0.0]) if system is free else 0.0)
         none = np.zeros((20, 0)), np.zeros((20, len(system.inputs)))
         forces.append(system.required(at, qd @ by.T, qdd @ by.T, *none, p) @ by)

@@ -122,9 +122,7 @@ def test_a_device_without_a_scale_is_refused(tmp_path: Path) -> None:
         inspected(tmp_path, free, used)
 
 
-def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
-    tmp_path: Path,
-) -> None:
+def test_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(tmp_path: Path) -> None:
     independent.record("joint", tmp_path / "session", 31, {}, mistakes.SHORT["joint"])
     MISTAKES["joint"]["encoder reversed"].spoil(tmp_path / "session")
     stages = '["ingest", "filter", "identify", "validate", "report"]'

@@ -358,7 +358,7 @@ ASIDE: dict[str, tuple[Damage, str]] = {
     ),
     "Parquet with text": (
         as_file(".parquet", lambda t: parquet({**t, "enc_yaw": t["enc_yaw"].astype(str)})),
-        "column 'enc_yaw': holds .*string, expected numbers",
+        "column 'enc_yaw': not numbers, but dates and times or text; is it the time",
     ),
 }
 

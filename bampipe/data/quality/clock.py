@@ -282,20 +282,13 @@ def drop_backward_stamps(table: TrialTable) -> None:
     behind = np.concatenate([[False], t[1:] < before])
     counts = int(repeated.sum()), int(behind.sum())
     if sum(counts) > _few(table, total):
-        at = int(np.argmax(repeated | behind))
+        what = f"{counts[0]} of {total} time stamps are repeated"
+        remedy = 'log them more finely; of evenly sampled rows, [time] unit = "samples" counts'
         if counts[1] > counts[0]:
-            raise table.fault(
-                f"time runs backwards: {counts[1]} of {total} stamps are not after those before",
-                column=table.clock,
-                at=at,
-                remedy="is this the time column? recordings of one file go into files of their own",
-            )
-        raise table.fault(
-            f"{counts[0]} of {total} time stamps are repeated",
-            column=table.clock,
-            at=at,
-            remedy='log them more finely; of evenly sampled rows, [time] unit = "samples" counts',
-        )
+            what = f"time runs backwards: {counts[1]} of {total} stamps are not after those before"
+            remedy = "is this the time column? recordings of one file go into files of their own"
+        at = int(np.argmax(repeated | behind))
+        raise table.fault(what, column=table.clock, at=at, remedy=remedy)
     table.keep(~(repeated | behind))
     faults = "a repeated time stamp", "a time stamp out of order"
     for count, what in zip(counts, faults, strict=True):

@@ -224,12 +224,10 @@ def leave_out_rails(table: TrialTable) -> None:
 
 
 def _motions(table: TrialTable, every: int = 1) -> list[SmoothedMotion]:
-    found = []
-    for encoder in table.session.encoders:
-        q = (table.columns[encoder.column][::every] - encoder.zero) * encoder.scale
-        motion = SmoothedMotion.of(table.t[::every], q)
-        found += [motion] if motion is not None else []
-    return found
+    encoders = table.session.encoders
+    positions = ((table.columns[e.column][::every] - e.zero) * e.scale for e in encoders)
+    found = (SmoothedMotion.of(table.t[::every], q) for q in positions)
+    return [motion for motion in found if motion is not None]
 
 
 def _sides(motions: list[SmoothedMotion]) -> Array:

@@ -32,8 +32,9 @@ _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     (TEXTS, text, "", ""),
     (SHEETS, text, "workbook of Excel", "save it again, or export the sheet as CSV"),
     ((".parquet",), parquet, "Parquet file", _AGAIN),
+    ((".feather", ".arrow"), parquet, "Feather file", _AGAIN),
     ((".mat",), mat.READER, "MATLAB file", "save it again from MATLAB"),
-    ((".h5", ".hdf5", ".hdf"), hdf5.READER, "HDF5 file", _AGAIN),
+    ((".h5", ".hdf5", ".hdf", ".nc"), hdf5.READER, "HDF5 file", _AGAIN),
     (_OBJECTS, objects.READER, "", ""),
     ((".tdms",), tdms.READER, "TDMS file", _AGAIN),
     ((".bag", ".db3"), bag, "bag", f"{_AGAIN}, with the message definitions in it"),
@@ -61,7 +62,7 @@ _KINDS = (
     (b"\x1f\x8b", (_UNPACK, ".gz"), "a gzip archive"),
     (b"version https://git-lfs", ("fetch the file: git lfs pull",), "a pointer of Git LFS"),
     (b"MATLAB", (".mat",), "a MATLAB file"),
-    (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".mat"), "an HDF5 file"),
+    (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".nc", ".mat"), "an HDF5 file"),
 )
 
 

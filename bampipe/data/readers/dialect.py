@@ -78,15 +78,20 @@ class TableLayout:
         first = next(iter(self.cells(text)), "")
         return _is_remark(text) or bool(re.match(r"[^\W\d_]{2}", first))
 
+    def ends_in_words(self, text: str) -> bool:
+        """Whether words, such as what an operator noted, stand behind the last cell of a line."""
+        behind = [cell for cell in self.cells(text)[len(self.header) :] if cell]
+        return bool(behind) and all(re.match(r"[^\W\d_]{2}", cell) for cell in behind)
+
     def is_chatter(self, text: str) -> bool:
-        """Whether a line among the samples is text without a number in any cell."""
+        """Whether a line among the samples is text without a number in any cell, or ends in it."""
         row = [cell for cell in self.cells(text) if cell not in NULLS]
         count = sum(_is_number(cell, self.decimal) or is_moment(cell) for cell in row)
         # A title of what follows may hold the number of it.
         titled = len(self.cells(text)) != len(self.header) and self.is_remark(text)
         plain = 2 * count < len(row) if titled else not count
         wordy = plain and text.expandtabs().isprintable() and any(map(str.isalpha, text))
-        return wordy or _is_remark(text)
+        return wordy or _is_remark(text) or self.ends_in_words(text)
 
 
 @dataclass(frozen=True)
@@ -307,13 +312,13 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
         row = [name.rstrip(",;") or name for name in row]
     row = [name.strip("\"'") for name in row]
     beside = cells(above[-1].text, delimiter) if above else []
-    if len(beside) == len(row) and all(
-        bool(a) != bool(b) for a, b in zip(row, beside, strict=True)
-    ):
-        # The names of an index stand below those of the columns, as pandas writes them.
-        groups = cells(above[-2].text, delimiter) if len(above) > 1 else []
+    if len(beside) == len(row) and sum(map(bool, beside)) > 1:
+        # The names of an index stand below those of the columns, as pandas writes them; else a cell
+        # of the line above goes on where this one is empty.
+        apart = all(bool(a) != bool(b) for a, b in zip(row, beside, strict=True))
+        groups = cells(above[-2].text, delimiter) if apart and len(above) > 1 else []
         groups = groups if len(groups) == len(row) else [""] * len(row)
-        return [a or f"{g} {b}".strip() for a, b, g in zip(row, beside, groups, strict=True)]
+        row = [a or f"{g} {b}".strip() for a, b, g in zip(row, beside, groups, strict=True)]
     if _is_key_of_names(row):
         row = ["Time" if name == row[0] else name for name in row]
     row = _named_items(row, rows, delimiter)

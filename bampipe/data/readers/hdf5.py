@@ -22,6 +22,8 @@ _MOST_DATASETS = 2000
 _BLOCK_ROWS = 1 << 14
 _COLUMNS = ("columns", "channels", "names", "column_names", "labels", "fields")
 """Attributes with the names of the columns of a matrix."""
+_PACKED = {"scale_factor": 1.0, "add_offset": 0.0}
+"""Attributes by which netCDF packs numbers into integers, and what they are where left out."""
 
 
 @contextmanager
@@ -50,21 +52,16 @@ def _arrays(file: Any, alone: bool) -> Iterator[tuple[str, Stored]]:
             yield label, stored(None, kind=LINK)
             continue
         names = _names(data)
-        for field in data.dtype.names or (None,):
-            array = _stored(data, field)
+        kind = "U" if data.attrs.get("MATLAB_class") == b"char" else data.dtype.kind
+        for at, field in enumerate(data.dtype.names or (None,)):
+            kind = data.dtype[field].kind if field else kind
+            array = Stored(data.shape, kind, partial(_read, data, field), _unit(data, at))
             if not (alone and names):
                 yield label if field is None else f"{label}.{field}", array
             for place, name in enumerate(names):
                 load, said = partial(_read, data, None, place), _unit(data, place)
                 column = Stored((max(data.shape),), array.kind, load, said)
                 yield f"{label}/{name}", column
-
-
-def _stored(data: Any, field: str | None) -> Stored:
-    kind = (data.dtype if field is None else data.dtype[field]).kind
-    kind = "U" if data.attrs.get("MATLAB_class") == b"char" else kind
-    place = data.dtype.names.index(field) if field else 0
-    return Stored(data.shape, kind, partial(_read, data, field), _unit(data, place))
 
 
 def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
@@ -109,9 +106,12 @@ def _read(data: Any, field: str | None, place: int | None = None) -> np.ndarray:
         starts = range(0, max(data.shape[:1], default=0), _BLOCK_ROWS)
         parts = [data[k : k + _BLOCK_ROWS][field] for k in starts]
         cells = np.concatenate(parts) if parts else np.asarray(data[field])
-    if place is not None:
-        return pick(cells, place)
-    return np.array(_texts(cells), dtype=object) if kind.kind in "OS" else cells
+    if kind.kind in "OS":
+        return np.array(_texts(cells), dtype=object)
+    if field is None and not _PACKED.keys().isdisjoint(data.attrs):
+        scale, offset = (np.ravel(data.attrs.get(*each))[0] for each in _PACKED.items())
+        cells = scale * cells + offset
+    return cells if place is None else pick(cells, place)
 
 
 def _texts(cells: Iterable[Any]) -> list[str]:

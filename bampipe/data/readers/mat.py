@@ -149,10 +149,8 @@ class _Elements:
             return
         if kind == _TEXT_CLASS:
             letters = self.take()
-            plain = bytes(letters[1]).decode(
-                "utf-16-le" if letters[0] in (4, 17) else "utf-8", "replace"
-            )
-            yield label, plain.strip("\0 ")
+            encoding = "utf-16-le" if letters[0] in (4, 17) else "utf-8"
+            yield label, bytes(letters[1]).decode(encoding, "replace").strip("\0 ")
             return
         yield label, None
         count, fields = math.prod(extents), [""]

@@ -8,8 +8,6 @@ as many names stands beside them, they have these.
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +19,8 @@ from bampipe.data.readers.trial import Wanted, opened
 from bampipe.data.units import units_beside
 from bampipe.errors import InputError
 
-
-@contextmanager
-def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
-    yield _contents(path, wanted.columns if wanted else ())
-
-
-READER = ArrayReader("value", _opened)
+_TRIED = 400
+"""Samples whose values are columns; what later ones alone hold is none."""
 
 
 def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -71,7 +64,8 @@ def _with_lists(content: object, depth: int = 2) -> object:
     return {key: _with_lists(item, depth - 1) for key, item in content.items()}
 
 
-def _contents(path: Path, wanted: Sequence[str]) -> Opened:
+@contextmanager
+def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     """What a file holds by name, what is ``wanted`` by other names too, and what was left out.
 
     It holds a list of objects, a list under one key, or one object a line (.jsonl). Numbers beside
@@ -114,7 +108,8 @@ def _contents(path: Path, wanted: Sequence[str]) -> Opened:
         kinds = {label: "M" * (array.dtype.kind == "O") for label, array in arrays.items()}
         called = called_signals(arrays, texts).items()
         held = {name: stored(arrays[x], unit, kinds[x]) for x, (name, unit) in called}
-        return _stating(held | alone, units), notes
+        yield _stating(held | alone, units), notes
+        return
     if not isinstance(content, list) and len(lists) != 1:
         raise InputError(
             f"{len(lists)} lists of samples: {', '.join(lists)}"
@@ -128,10 +123,16 @@ def _contents(path: Path, wanted: Sequence[str]) -> Opened:
     for number, sample in enumerate(samples, 1):
         if not isinstance(sample, dict):
             raise InputError("not an object with named values", where=f"sample {number}")
-    named = [x for x, cell in leaves(samples[0]) if reads_as_number(cell) or _is_moment(cell)]
-    named += [name for name in wanted if find(samples[0], name) is not MISSING]
+    # Records of several kinds may stand in turn.
+    first = [cell for sample in samples[:_TRIED] for cell in leaves(sample)]
+    named = [x for x, cell in first if reads_as_number(cell) or _is_moment(cell)]
+    asked = wanted.columns if wanted else ()
+    named += [x for x in asked if any(find(s, x) is not MISSING for s in samples[:_TRIED])]
     found = {name: _column(samples, name, units) for name in dict.fromkeys(named)}
-    return _stating(found | {x: alone[x] for x in alone if x not in found}, units), notes
+    yield _stating(found | {x: alone[x] for x in alone if x not in found}, units), notes
+
+
+READER = ArrayReader("value", _opened)
 
 
 def _stating(found: Mapping[str, Stored], units: Mapping[str, str]) -> dict[str, Stored]:
@@ -144,17 +145,17 @@ def _column(samples: Sequence[object], name: str, units: Mapping[str, str]) -> S
     shape, first = (len(samples),), (x for x in _cells(samples, name) if x is not None)
     if _is_moment(next(first, None)):
         return Stored(shape, "M", lambda: np.array([*_cells(samples, name)], dtype=object))
-    return Stored(shape, "f", partial(_read_numbers, samples, name), units.get(name, ""))
+
+    def load() -> np.ndarray:
+        places = (f"sample {n}, '{name}'" for n, _ in enumerate(samples, 1))
+        return np.fromiter(map(as_number, _cells(samples, name), places), float, len(samples))
+
+    return Stored(shape, "f", load, units.get(name, ""))
 
 
 def _cells(samples: Sequence[object], name: str) -> Iterator[object]:
     found = (find(sample, name) if name else sample for sample in samples)
     return (None if cell is MISSING else cell for cell in found)
-
-
-def _read_numbers(samples: Sequence[object], name: str) -> np.ndarray:
-    places = (f"sample {n}, '{name}'" for n in count(1))
-    return np.fromiter(map(as_number, _cells(samples, name), places), float, len(samples))
 
 
 def _is_moment(cell: object) -> bool:

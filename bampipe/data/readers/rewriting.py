@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import Any
 
 from bampipe.data.readers.dialect import cells
@@ -137,12 +137,18 @@ def _of_program(head: str, whole: Sequence[str]) -> Form | None:
     """The form of a text of LabVIEW, AcqKnowledge or Qualisys; None of others."""
     if head.startswith("LabVIEW Measurement") and "\nX_Value" in head:
         stated = next((re.split(r"[\t,]", x)[1:] for x in whole if x.startswith("Y_Unit")), [])
+        step, samples = re.search(r"\nDelta_X\t([^\t\r\n]+)", head), count()
 
         def rewrite(line: str) -> str:
+            nonlocal samples
+            if step and re.match(r"\t.*\d", line):  # no column of times
+                stamp = f"{next(samples) * float(step[1].replace(',', '.')):.9f}"
+                return (stamp.replace(".", ",") if "," in step[1] else stamp) + line
             if not line.startswith("X_Value"):
                 return "" if _LABVIEW.match(line) else line
+            samples = count()
             time, *names = re.split(r"[\t,]", re.sub(r"[\t,](Comment)?$", "", line))
-            units = (f" [{u}]" if unit(u) else "" for u in (*stated, *names))
+            units = (f" [{u}]" if u and unit(u) else "" for u in (*stated, *names))
             return "\t".join([time, *(n + u for n, u in zip(names, units, strict=False))])
 
         return Form("heads of LabVIEW left out", rewrite)

@@ -121,11 +121,10 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
 
 
 def _sheet(file: BinaryIO) -> BinaryIO:
-    """The first sheet of a workbook that holds rows, as CSV; InputError without openpyxl."""
+    """The sheet of a workbook that has most rows, as CSV; InputError without openpyxl."""
     book = need("openpyxl", "xlsx").load_workbook(file, read_only=True, data_only=True)
-    rows = next(
-        (r for s in book.worksheets if len(r := list(s.iter_rows(values_only=True))) > 1), []
-    )
+    sheets = ([*sheet.iter_rows(values_only=True)] for sheet in book.worksheets)
+    rows = max(sheets, key=len, default=[])
     text = io.StringIO(newline="")
     csv.writer(text).writerows(rows)
     return io.BytesIO(text.getvalue().encode())
@@ -274,7 +273,9 @@ def _read_samples(stream: BinaryIO, layout: TableLayout, end: int, samples: _Sam
                     remedy="take them out, or log them to another file",
                 ) from error
             else:
-                samples.notes.append(f"row {line.number} is text and no sample: left out")
+                ends = layout.ends_in_words(line.text)
+                what = "ends in words" if ends else "is text and no sample"
+                samples.notes.append(f"row {line.number} {what}: left out")
             samples.resumed.append((samples.rows, line.number + 1))
             layout = replace(layout, start=line.end, first_line=line.number + 1)
 

@@ -317,10 +317,7 @@ def _geared(
         else "positions are those of motors, by weight and inertia as drawn with these turns for"
         f" one of the joint: {listed}; {PUT_IN}"
     )
-    explained = max(0.0, 1.0 - mean_left(found.drives))
-    notes.check.append(
-        f"drawing, drives' inertia and friction explain {explained:.1%} of the drives"
-    )
+    notes.check.append(_explained(found.drives))
     drives = dict(zip(device.forces, found.drives, strict=True))
     return RobotColumns(joints, columns, drives, gears, found.mounting)
 
@@ -426,6 +423,9 @@ def _sentences(
             f"signs and sizes of the drives agree with weight and inertia as drawn (1 is perfect):"
             f" {', '.join(agreed)}"
         )
-    explained = max(0.0, 1.0 - mean_left(list(drives.values())))
-    lines.append(f"drawing, drives' inertia and friction explain {explained:.1%} of the drives")
-    return lines
+    return [*lines, _explained(list(drives.values()))]
+
+
+def _explained(drives: Sequence[Drive]) -> str:
+    share = max(0.0, 1.0 - mean_left(drives))
+    return f"drawing, drives' inertia and friction explain {share:.1%} of the drives"
