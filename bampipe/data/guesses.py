@@ -49,7 +49,7 @@ _STEADY = 50.0
 """Of the median step: the longest one of a time."""
 _COPIED = 1e-3
 """Residual of a column regressed on a copy of it, over its standard deviation: rounding alone."""
-_MOST_IN_TURN, _GOES_ON, _LEAPS = 64, 0.2, 0.4
+MOST_IN_TURN, _GOES_ON, _LEAPS = 64, 0.2, 0.4
 """Quantities that take turns in one column, the most; change from one reading of a quantity to its
 next, over that from row to row, the most; the latter, squared, over twice the variance, the least.
 """
@@ -127,10 +127,10 @@ def take_turns(values: np.ndarray, keys: Sequence[np.ndarray]) -> bool:
 
     Readings leap from row to row, but not between rows with one of a key (T,), or every so many.
     """
-    leaps = float(np.mean(np.diff(values) ** 2)) if len(values) > 10 * _MOST_IN_TURN else 0.0
+    leaps = float(np.mean(np.diff(values) ** 2)) if len(values) > 10 * MOST_IN_TURN else 0.0
     if not leaps > 2.0 * _LEAPS * float(np.var(values)):
         return False
-    rows, turns = np.arange(len(values)), range(2, _MOST_IN_TURN + 1)
+    rows, turns = np.arange(len(values)), range(2, MOST_IN_TURN + 1)
     orders = (np.argsort(key, kind="stable") for key in (*keys, *(rows % n for n in turns)))
     return any(np.mean(np.diff(values[each]) ** 2) < _GOES_ON**2 * leaps for each in orders)
 

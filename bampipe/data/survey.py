@@ -11,7 +11,7 @@ from unicodedata import combining, normalize
 import numpy as np
 
 from bampipe.data import readers
-from bampipe.data.guesses import describe, find_roles, is_time, take_turns
+from bampipe.data.guesses import MOST_IN_TURN, describe, find_roles, is_time, take_turns
 from bampipe.data.parts import axes_of, join_parts
 from bampipe.data.readers import columns_of, extension_of, is_log, is_text, lerobot, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
@@ -28,8 +28,9 @@ _MOST_COLUMNS = 500
 """Of a table of samples, unless it has many rows."""
 _OTHER_DATA = {
     **dict.fromkeys((".xls", ".ods"), "save the sheet as .xlsx or CSV"),
+    **dict.fromkeys((".db", ".sqlite", ".sqlite3"), "export its table as CSV"),
     **dict.fromkeys((".pkl", ".pickle", ".joblib"), "it may run any program; save with np.savez"),
-    **dict.fromkeys((".feather", ".arrow", ".orc", ".rds"), "save it as Parquet or CSV"),
+    **dict.fromkeys((".orc", ".rds"), "save it as Parquet or CSV"),
     **dict.fromkeys((".zip", ".gz", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
     **dict.fromkeys(
         (".c3d", ".mf4", ".mdf", ".blf", ".bin", ".ulg", ".tlog", ".trc", ".r64", ".fig", ".slx"),
@@ -50,7 +51,7 @@ _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 _WORDS = {
     "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
     " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
-    " tid czas cas zaman aika ido ipoc",
+    " tid czas cas zaman aika ido ipoc timer",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
     " wanted con ctrl action ziel consigne consigna referencia riferimento planned requested",
     "brake": "brake bremse",
@@ -76,7 +77,7 @@ _SIGNS = {
     "время": "time", "угол": "angle", "скорость": "velocity", "момент": "torque", "ток": "current",
 }  # fmt: skip
 """Words of other scripts; of those inside others the longer comes first."""
-_PLAIN = str.maketrans({"ı": "i", "ł": "l", "Ł": "L", "ø": "o", "ß": "ss"})
+_PLAIN = str.maketrans({"ı": "i", "ł": "l", "Ł": "L", "ø": "o", "ß": "ss", "µ": "u", "μ": "u"})
 _ALL_WORDS = frozenset(word for text in _WORDS.values() for word in text.split())
 _ENDS = sorted((word for word in _ALL_WORDS if len(word) > 4 or word in ("time", "zeit")), key=len)
 _RUN_TOGETHER = re.compile(r"(q|dq|tau|trq|pos|vel)(des|ref|cmd|meas|msr|act)")
@@ -93,7 +94,7 @@ _BY_UNIT = {
     "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
     "m/s": "velocity", "kg": "force", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
 }  # fmt: skip
-_SHORT_UNITS = frozenset(["mm", "Nm", "kN", "mA", "mV"])
+_SHORT_UNITS = frozenset(["mm", "Nm", "kN", "gf", "mA", "mV"])
 _PLAIN_WORDS = frozenset(
     ["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano", "meter"]
 )
@@ -109,9 +110,9 @@ _JOINED = {
 }
 _UNIT_WORDS = {
     "time": ("us", "ms", "ns", "s", "min"),
-    "position": ("mrad", "rad", "deg", "mm", "cm", "um", "m"),
+    "position": ("mrad", "rad", "deg", "°", "mm", "cm", "um", "nm", "m"),
     "velocity": ("rad/s", "deg/s", "mm/s", "m/s", "rpm"),
-    "force": ("Nm", "kN", "N", "V", "kg", "g"),
+    "force": ("mNm", "Ncm", "Nmm", "Nm", "kN", "cN", "mN", "N", "V", "kp", "kg", "g", "gf", "%"),
     "current": ("mA", "A"),
     "voltage": ("mV", "V", "percent", "pct", "%"),
 }
@@ -255,11 +256,11 @@ class _Logs:
             if path.is_file()
             and not any(part.startswith(".") for part in path.relative_to(folder).parts)
         )
-        paths = [p for p in files if extension_of(p.name) not in _OTHER_DATA and is_log(p)]
-        for path in files:
-            if (extension := extension_of(path.name)) in _OTHER_DATA:
-                why = f"*{extension} is not read: {_OTHER_DATA[extension]}"
-                self.passed.append((path.relative_to(folder).as_posix(), why))
+        other = {p: end for p in files if (end := extension_of(p.name)) in _OTHER_DATA}
+        paths = [path for path in files if path not in other and is_log(path)]
+        for path, end in other.items():
+            why = f"*{end} is not read: {_OTHER_DATA[end]}"
+            self.passed.append((path.relative_to(folder).as_posix(), why))
         if not paths:
             others = [p.relative_to(folder).as_posix() for p in files]
             names = join_names([name for name, _ in self.passed] or others, 4)
@@ -468,12 +469,14 @@ class _Logs:
             unit = _unit(column, said, role)
             found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
         keys = [c.values for c in found if c.is_integer and c.role not in ("time", "position")]
-        for moved in (c for c in found if c.role == "position" and take_turns(c.values, keys)):
+        nameless = [c for c in found if not c.role and len(np.unique(c.values)) > MOST_IN_TURN]
+        moves = [c for c in found if c.role == "position"] or nameless
+        for moved in (c for c in moves if take_turns(c.values, keys)):
             raise InputError(
-                f"{moved.name} is of another axis in each row",
+                f"{moved.name} is of another axis{'' if moved.role else ' or signal'} in each row",
                 where=trial.file,
-                remedy="write a file for each axis, such as frame[k::n] or frame.groupby(ID) of"
-                " pandas, or a column for each",
+                remedy="write a file for each, such as frame[k::n] or frame.groupby(ID) of pandas,"
+                " or a column for each",
             )
         return tuple(found)
 
@@ -612,9 +615,9 @@ def _role(name: str, stated: str) -> str:
         alone = _role(bare, stated)
         vague = set(words(bare)) <= _GENERAL or not alone
         return (vague and _role(part, "")) or alone
-    if stated == "datetime" or name.strip().lower() in (*_UNIT_WORDS["time"], "x_value"):
-        return "time"
-    if name.strip().rpartition(".")[2] == "ts":  # Ts is rather an interval
+    plain = name.strip()
+    named = plain.lower() in _UNIT_WORDS["time"] or plain.lower().startswith("x_value")
+    if stated == "datetime" or named or plain.rpartition(".")[2] == "ts":  # Ts: rather an interval
         return "time"
     said = set(words(name))
     said |= {word.removesuffix(end) for word in said for end in ("s", "ed") if len(word) > 3}
@@ -655,18 +658,19 @@ def _role_by_suffix(suffix: str) -> str:
 def _unit(name: str, stated: str, role: str) -> str:
     """Unit by the file, or by a last word of the name such as ``_us``, before an index if any."""
     if stated:
-        known = unit(stated)
-        return "rev/s" if role == "velocity" and known == unit("Hz") else stated
-    bare = re.sub(r"(\[\d+\]|_\d+)$", "", name)
-    rate = re.search(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$", bare)
-    if role == "velocity" and rate is not None:
+        return "rev/s" if role == "velocity" and unit(stated) == unit("Hz") else stated
+    bare = re.sub(r"(\[\d+\]|_\d+)$", "", name.translate(_PLAIN))
+    if role == "velocity" and (rate := re.search(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$", bare)):
         return f"{rate[1]}/s"
-    parts = re.split(r"[_\W]+", bare)
-    suffix = parts[-1] if len(parts) > 1 else ""
-    arm = unit(".".join(parts[-2:])) if role == "force" and len(parts) > 2 else None  # in_lbs, N_m
-    if arm is not None and arm.si == "N.m":
-        return ".".join(parts[-2:])
-    matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == suffix.lower()]
-    if matches or role == "time" or len(suffix) <= _LONGEST_WORD:
-        return next(iter(matches), "")
-    return suffix if role and _role_by_unit(suffix) == role else ""
+    parts = re.findall(r"(?:\d+\.(?=\d))?[^\W_]+|[°%]", bare)
+    both = ".".join(parts[-2:]) if role == "force" and len(parts) > 2 else ""  # in_lbs, not in_N
+    if re.match("in.(lb|oz)|(?!in.)", both.lower()) and (arm := unit(both)) and arm.si == "N.m":
+        return both
+    known = _UNIT_WORDS.get(role, ())
+    inner = (part for part in parts[-2:0:-1] if len(part) > 1 and part in known)  # pos_mm_act
+    for suffix in (*parts[1:][-1:], *inner):
+        matches = [u for u in known if u.lower() == suffix.lower()]
+        long = role not in ("", "time") and len(suffix) > _LONGEST_WORD
+        if matches or (long and _role_by_unit(suffix) == role):
+            return next(iter(matches), suffix)
+    return ""

@@ -25,7 +25,7 @@ _FACTORS: dict[str, tuple[str, float]] = {
     "deg": ("rad", math.pi / 180), "rev": ("rad", _TURN), "arcmin": ("rad", math.pi / 10_800),
     "arcsec": ("rad", math.pi / 648_000), "in": ("m", 0.0254), "ft": ("m", 0.3048),
     "gon": ("rad", math.pi / 200), "kgf": ("N", _GRAVITY), "gf": ("N", 1e-3 * _GRAVITY),
-    "lbf": ("N", _POUND),
+    "kp": ("N", _GRAVITY), "lbf": ("N", _POUND),
     "ozf": ("N", _POUND / 16), "kip": ("N", 1e3 * _POUND), "bar": ("Pa", 1e5),
     "psi": ("Pa", _POUND / 0.0254**2),
 }  # fmt: skip
@@ -39,22 +39,23 @@ _PREFIXED = frozenset(["s", "m", "rad", "deg", "N", "A", "V", "W", "Hz", "Pa", "
 _WHOLE = {
     "1/min": "rev/min", "-": "", "1": "",
     "none": "", "ozin": "ozf.in", "kgcm": "kgf.cm", "inlb": "lbf.in", "lbin": "lbf.in",
-    "ftlb": "lbf.ft", "lbft": "lbf.ft",
+    "ftlb": "lbf.ft", "lbft": "lbf.ft", "kgfcm": "kgf.cm",
 }  # fmt: skip
 _RATES = {"rpm": "rev/min", "r/min": "rev/min", "rps": "rev/s", "dps": "deg/s"}
 _SPELLINGS = {
-    "rot": "rev", "turn": "rev", "degree": "deg", "°": "deg",
+    "rot": "rev", "turn": "rev", "degree": "deg", "°": "deg", "Grad": "deg", "micron": "um",
     "º": "deg", "radian": "rad", "revolution": "rev", "rotation": "rev", "second": "s",
     "sec": "s", "minute": "min", "millisecond": "ms", "microsecond": "us", "nanosecond": "ns",
     "milli": "ms", "micro": "us", "nano": "ns", "msec": "ms", "usec": "us", "nsec": "ns",
     "volt": "V", "v": "V", "amp": "A", "ampere": "A", "a": "A", "n": "N", "newton": "N",
-    "newtonmeter": "Nm", "kn": "kN", "milliamp": "mA", "meter": "m", "metre": "m",
+    "newtonmeter": "Nm", "kn": "kN", "milliamp": "mA", "meter": "m", "metre": "m", "gram": "g",
     "millimeter": "mm", "millimetre": "mm", "centimeter": "cm", "inch": "in", "inche": "in",
     "foot": "ft", "feet": "ft", "lb": "lbf", "pound": "lbf", "oz": "ozf", "hz": "Hz",
     "percent": "%", "pct": "%", "Arms": "A", "Vdc": "V", "Vrms": "V", "U": "rev", "Umdr": "rev",
     "tr": "rev", "grado": "deg", "grados": "deg", "grader": "deg", "derece": "deg", "degré": "deg",
 }  # fmt: skip
 """Of single factors; those in the plural are found without their s."""
+_PLAIN = str.maketrans("µμ²³⁻¹", "uu23-1")
 _CELSIUS = frozenset(["degc", "°c", "c", "celsius"])
 _NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
 _BESIDE = re.compile(r"(?i)(?:\A|(?<=[./]))units?[./]|(?:\A|[ _./])units?\Z")
@@ -81,8 +82,8 @@ def spelled(text: str, among: Sequence[str]) -> str:
 
 
 def bare(text: str) -> str:
-    """A unit without the brackets in which some files have it."""
-    return text.strip().strip("[]()").strip()
+    """A unit without the brackets in which some files have it, and without the start of a clock."""
+    return text.strip().strip("[]()").partition(" since ")[0].strip()
 
 
 def units_in(names: Iterable[str]) -> dict[str, str]:
@@ -117,8 +118,7 @@ def unit(text: str) -> RecordedUnit | None:
     prefix, ``13.5mA`` is a reading in steps of 13.5 mA. ``nm`` is a nanometre, not a torque; a
     mass times a length is a torque.
     """
-    plain = bare(text).replace("µ", "u").replace("μ", "u")
-    plain = plain.replace("²", "2").replace("³", "3").replace("⁻", "-").replace("¹", "1")
+    plain = bare(text).translate(_PLAIN)
     plain = re.sub(r"(?:x ?)?\b10(?:\^|\*\*)(-?\d+)", r"1e\1", plain)
     plain = _WHOLE.get(plain.lower().replace("-", "").replace(".", "") or plain, plain)
     plain = re.sub(
@@ -149,9 +149,9 @@ def unit(text: str) -> RecordedUnit | None:
 
 def _factor(word: str) -> list[tuple[str, float]] | None:
     """SI unit and scale of one factor, or of two written without anything between them."""
-    pair = re.fullmatch(r"(.*N)(m|cm|mm|M)", word)
+    pair = re.fullmatch(r"(.*N|[mk]n|n(?=[cm]m))(m|cm|mm|M)", word)
     if pair:
-        parts = [_factor(each) for each in (pair[1], pair[2].lower())]
+        parts = [_factor(each) for each in (f"{pair[1][:-1]}N", pair[2].lower())]
         return [found for part in parts if part for found in part] if all(parts) else None
     low = word.lower()
     singular = low.removesuffix("s") if len(low) > 2 else low

@@ -57,6 +57,9 @@ FORMS = {
         lines("{t:.3f},{q:.4f},{t:.3f},{u:.4f}", "Arm,,Cell,\nt,x,t,x\n"),
         ("Arm t", "Arm x", "Cell x"),
     ),
+    "names in two lines": (
+        lines("{t:.3f},{q:.4f},{u:.4f}", "Run 1,,\nTime,Arm,\n,q,u\n"), ("Time", "q", "u")
+    ),
     "names twice": (lines("{t:.3f},{q:.4f},{u:.4f}", "t,x,x\n"), ("t", "x (1)", "x (2)")),
     "properties of channels": (
         lines("{t:.3f}\t{q:.4f}\t{t:.3f}\t{u:.4f}", f"Scope\n\n{PROPERTIES}"),
@@ -211,6 +214,15 @@ def test_encodings_of_chinese_and_japanese(tmp_path: Path, encoding: str, time: 
     assert list(columns_of(path)) == ["temps (s)", "angle mesuré (°)"]
 
 
+def test_units_are_heard_wherever_they_stand_in_a_name(tmp_path: Path):
+    units = {
+        "Kraft in N": "N", "force_mN_raw": "mN", "torque_in_lbs": "in.lbs", "push_gf": "gf",
+        "pos_0.1mm": "0.1mm", "Winkel / °": "°", "pos µm": "um",
+    }  # fmt: skip
+    write(tmp_path / "a.csv", ",".join(["t_s", *units]), T, *[Q] * len(units))
+    assert {c.name: c.unit for c in survey(tmp_path).columns} == {"t_s": "s", **units}
+
+
 def test_channels_go_by_the_names_beside_them(tmp_path: Path):
     """Scopes of Simulink and dSPACE, cells of MATLAB, matrices of HDF5, lists of JSON, NumPy."""
     kind = [("Name", object), ("Data", object), ("Unit", object)]
@@ -293,7 +305,10 @@ def test_a_log_out_of_order_is_refused(tmp_path: Path, order: np.ndarray):
 
 
 def test_data_of_other_kinds_are_named_with_what_to_do(tmp_path: Path):
-    (tmp_path / "a.xls").write_bytes(b"")
+    (tmp_path / "b.db").write_bytes(b"")
+    with pytest.raises(InputError, match=r"but b.db; \*.db is not read: export its table as CSV"):
+        survey(tmp_path)
+    (tmp_path / "b.db").rename(tmp_path / "a.xls")
     with pytest.raises(InputError, match=r"but a.xls; \*.xls is not read: save the sheet as .xlsx"):
         survey(tmp_path)
     wide = "\n".join(",".join(f"{v:.3f}" for v in np.tile(row, 20)) for row in (T, Q, U))
@@ -398,10 +413,13 @@ def test_a_second_table_in_a_file_and_a_segment_of_labview(tmp_path):
     (tmp_path / "a.csv").write_text(table + "\nModel Outputs\n200\nFrame,X\n1,2\n")
     with pytest.raises(InputError, match="row 64: another table begins; save each table"):
         read_trial(tmp_path / "a.csv", ["t", "q"], name="a.csv")
-    text = HEAD + 2 * lines("{t:.3f}\t{q:.4f}\t{u:.4f}", SEGMENT)
-    (tmp_path / "a.lvm").write_text(text)
-    raw = read_trial(tmp_path / "a.lvm", ["Angle [Degrees]"], name="a.lvm")
-    assert len(raw) == 120 and raw.begun == (60,)
+    for time in ("{t:.3f}", ""):  # with a column of times, and without
+        text = HEAD + 2 * lines(f"{time}\t{{q:.4f}}\t{{u:.4f}}", SEGMENT)
+        (tmp_path / "a.lvm").write_text(text.replace(".", ","))
+        raw = read_trial(tmp_path / "a.lvm", ["X_Value", "Angle [Degrees]"], name="a.lvm")
+        assert raw.begun == (60,)
+        np.testing.assert_allclose(raw.columns["X_Value"], [*T, *T], atol=1e-9)
+        np.testing.assert_array_equal(raw.columns["Angle [Degrees]"], [*Q, *Q])
     blocks = [lines("{t:.3f}\t{q:.4f}", f"Block\t\tAt\t{k}\ts\nt\tq\nSec\tmm\n") for k in "12"]
     (tmp_path / "a.dat").write_text("\n".join(blocks))
     assert read_trial(tmp_path / "a.dat", ["t", "q"]).begun == (60,)
@@ -415,7 +433,13 @@ def test_axes_in_turn_copies_and_whole_seconds(tmp_path):
     for name, values in {"position": both[0], "torque": both[1], "time": t}.items():
         write(tmp_path / f"c/{name}.txt", "", np.sort(values))
     write(tmp_path / "e/e.csv", "t_s,q_rad,tau_Nm,volt", t, q, u, np.round(40 * q + 1, 3))
-    for name, said in (("a", "of another axis in each row"), ("c", "2 rows for each time in time")):
+    values = np.rint(1e3 * np.column_stack([q, u]).ravel())
+    write(tmp_path / "b/b.csv", "stamp,ID,value", np.repeat(t, 2), np.tile([385, 641], 900), values)
+    for name, said in (
+        ("a", "q_rad is of another axis in each row"),
+        ("b", "value is of another axis or signal in each row; write a file for each"),
+        ("c", "2 rows for each time in time"),
+    ):
         with pytest.raises(InputError, match=said):
             propose(tmp_path / name)
     assert any(line.startswith("volt repeats q_rad") for line in propose(tmp_path / "e").check)
@@ -428,13 +452,15 @@ def test_codes_for_no_reading_are_taken_for_none_and_hours_pass(tmp_path):
     text = ""
     for n, (q, u) in enumerate(zip(Q, U, strict=True)):
         second, reading = 3599.7 + 0.01 * n, -9999.0 if n in (7, 30, 31) else u
+        q, reading = (0.0, 0.0) if n in (20, 25, 26) else (q, reading)
         text += f"{int(second // 60) % 60:02d}:{second % 60:06.3f},{q},{reading}\n"
     (tmp_path / "a.csv").write_text("Time,q,u\n" + text)
     entry, clock = TrialEntry(file="a.csv", kind="free"), Clock(column="Time", unit="datetime")
     raw = read_recording(tmp_path, entry, ["Time", "q", "u"], clock)
-    assert np.flatnonzero(np.isnan(raw.columns["u"])).tolist() == [7, 30, 31]
+    assert len(raw) == 57 and {22, 27, 28}.isdisjoint(raw.rows)
+    assert raw.rows[np.isnan(raw.columns["u"])].tolist() == [9, 32, 33]
     assert "column 'u': 3 readings of -9999 are taken for none" in raw.notes
-    np.testing.assert_allclose(np.diff(raw.columns["Time"]), 0.01, atol=2e-3)
+    np.testing.assert_allclose(raw.columns["Time"], np.delete(T, [20, 25, 26]), atol=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -230,7 +230,9 @@ def test_units_that_contradict_the_file_are_refused(tmp_path, change, said):
         ("0.229rpm", "rad/s", 0.229 * np.pi / 30), ("deg/10", "rad", np.pi / 1800),
         ("U/min", "rad/s", np.pi / 30), ("gon", "rad", np.pi / 200), ("daN", "N", 10.0),
         ("grados", "rad", np.pi / 180), ("10^-3 s", "s", 1e-3), ("NM", "N.m", 1.0),
-        ("N・m", "N.m", 1.0),
+        ("N・m", "N.m", 1.0), ("ncm", "N.m", 0.01), ("mnm", "N.m", 1e-3),
+        ("seconds since 2026-03-01 10:00:00", "s", 1.0), ("microns", "m", 1e-6),
+        ("kp", "N", 9.80665), ("kgfcm", "N.m", 0.0980665), ("Grad", "rad", np.pi / 180),
     ],
 )  # fmt: skip
 def test_units_of_logs(text, si, scale):

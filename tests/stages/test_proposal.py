@@ -32,7 +32,7 @@ from bampipe.physics import registry
 from bampipe.physics.units import check_device
 from bampipe.progress import silent
 from bampipe.setup.proposal import propose, write_proposal
-from bampipe.setup.proposal.notes import COLUMNS
+from bampipe.setup.proposal.notes import UNDRIVEN
 from bampipe.setup.proposal.starter import Drive, starter_device
 from bampipe.stages import ingest
 
@@ -176,24 +176,14 @@ def test_tables_of_any_extension_are_read_and_prose_beside_them_is_no_table(tmp_
     np.testing.assert_allclose(found["q_joint"], whole, atol=1e-5)
 
 
-def arm_log(turned: float = 0.0) -> dict[str, np.ndarray]:
-    """The joint's log in rad and N.m, and its time in whole seconds and nanoseconds."""
-    columns = joint_log(1)
-    angle = np.deg2rad(columns["joint_angle"]) + turned
-    return {
-        "stamp": columns["stamp"],
-        "angle": (angle + np.pi) % (2 * np.pi) - np.pi,
-        "torque": 1e-3 * PER_AMPERE * columns["motor_current"],
-    }
-
-
 def test_joint_states_of_a_robot_that_wrap_at_half_a_turn(tmp_path):
     (tmp_path / "arm").mkdir()
-    columns = arm_log(turned=3.0)
+    log = joint_log(1)
+    turned = (np.deg2rad(log["joint_angle"]) + 3.0 + np.pi) % (2 * np.pi) - np.pi
     rows = ["header.stamp.sec,header.stamp.nanosec,name[0],position[0],effort[0]"]
-    for t, q, torque in zip(*columns.values(), strict=True):
+    for t, q, current in zip(log["stamp"], turned, log["motor_current"], strict=True):
         nano = round((t - int(t)) * 1e9)
-        rows.append(f"{int(t)},{nano},elbow,{q:.7f},{torque:.6f}")
+        rows.append(f"{int(t)},{nano},elbow,{q:.7f},{1e-3 * PER_AMPERE * current:.6f}")
     (tmp_path / "arm/a.csv").write_text("\n".join(rows) + "\n")
     session, _ = proposed(tmp_path / "arm")
     assert session["time"]["column"] == "header.stamp.sec" and session["sample_rate_hz"] == 100
@@ -210,8 +200,8 @@ def test_joint_states_of_a_robot_that_wrap_at_half_a_turn(tmp_path):
 
 
 def test_duty_cycle_and_supply_make_a_motor(tmp_path):
-    t, q, torque = arm_log().values()
-    table = {"t": t - t[0], "present_angle_deg": np.rad2deg(q), "pwm_percent": 8 * torque}
+    t, q, _, torque = labelled("t,q,w,u").values()
+    table = {"t": t, "present_angle_deg": np.rad2deg(q), "pwm_percent": 8 * torque}
     table["vbat"] = 12 + 0.01 * (np.arange(len(t)) % 3)
     session, proposal = proposed_for(table, tmp_path)
     assert session["encoders"]["joint"] == {"column": "present_angle_deg", "unit": "deg"}
@@ -351,7 +341,7 @@ def test_a_force_that_is_not_there_is_asked_for_where_it_is_read(tmp_path, comma
     t = 0.01 * np.arange(2000)
     table = {"time [s]": t, "position [rad]": np.sin(t), "current [A]": np.full_like(t, 1.25)}
     session, proposal = proposed_for(table, tmp_path)
-    assert proposal.fill_in == ["the column of force_drive in N.m. To find it: " + COLUMNS]
+    assert proposal.fill_in == ["the column of force_drive in N.m. To find it: " + UNDRIVEN]
     assert session["force"] == {"columns": ["?"], "components": ["drive"], "unit": "N.m"}
     code, _, err = command("ingest", tmp_path)
     assert code == 2 and "fill in the name of the column" in err
@@ -492,6 +482,8 @@ def test_units_at_the_end_of_names_and_what_slides(tmp_path):
     assert "driven by a current" in proposal.device
     session, proposal = proposed_for(labelled("t,dist,w,forc"), tmp_path / "b")
     assert session["force"]["unit"] == "N" and "linear axis" in " ".join(proposal.check)
+    session, _ = proposed_for(labelled("timer,stage pos mm,w,push_gf"), tmp_path / "c")
+    assert session["time"]["column"] == "timer" and session["force"]["unit"] == "gf"
 
 
 def test_a_current_position_is_no_current_and_an_acceleration_drives_nothing(tmp_path):
@@ -656,6 +648,13 @@ def test_ticks_of_a_counter_and_slow_logs_are_asked_about(tmp_path):
     assert session["time"] == {"column": "ticks", "unit": "ticks", "ticks_per_s": 0.0}
     (ask,) = proposal.fill_in
     assert ask.startswith("ticks_per_s, what ticks counts in a second") and "data sheet" in ask
+    for name, scale, time in (
+        ("time [0.1 ms]", 1e4, {"unit": "ticks", "ticks_per_s": 1e4}),
+        ("time in cycle [ms]", 1e3, {"unit": "ms"}),
+    ):
+        log = labelled(f"{name},angle_rad,w,torque_nm", t=scale)
+        session, proposal = proposed_for(log, tmp_path / f"{scale:g}")
+        assert session["time"] == {"column": name, **time} and proposal.fill_in == []
     slow = {n: v[::10] for n, v in labelled("t,q,w,u").items()}
     assert "too slow for inertia" in str(proposed_for(slow, tmp_path / "b")[1].check)
 
@@ -709,6 +708,11 @@ def test_what_needs_a_gain_gets_wide_priors(tmp_path):
 
 def test_what_a_drive_moves_is_the_axis_and_a_named_force_comes_before_looks(tmp_path):
     t, q, u = machine(6)
+    table = {"t": t, "x_mm": q, "F_pull_N": u.clip(0.0), "F_push_N": (-u).clip(0.0)}
+    _, proposal = proposed_for(table, tmp_path / "c")
+    assert any("F_push_N may act on the axis, too, and is not used" in x for x in proposal.check)
+    table = {"t": t, "q_rad": q, "abs_torque": np.abs(u), "torque_dir": (u < 0.0).astype(float)}
+    assert proposed_for(table, tmp_path / "d")[0]["force"]["columns"] == ["abs_torque"]
     table = {"time_s": t, "pole_angle": np.sin(3.0 * t), "cart_angle": q, "torque_Nm": u}
     encoders = proposed_for(table, tmp_path)[0]["encoders"]
     assert [encoder["column"] for encoder in encoders.values()] == ["cart_angle"]

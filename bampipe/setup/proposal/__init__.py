@@ -5,7 +5,7 @@ a radian, is left at a value that the session reader refuses with a line saying 
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -115,6 +115,12 @@ def propose(
             " [[trials]]"
         )
     left = [column.name for column in found.columns if column.name not in match.used]
+    beside = [c.name for c in found.of("force") if c.name in left and not c.is_constant]
+    if beside and match.axes == 1 and len(match.rivals) < 2:
+        notes.check.append(
+            f"{join_names(beside, 4)} may act on the axis, too, and is not used: if so, log the sum"
+            " of all that do, with their signs, in one column"
+        )
     passed: dict[str, list[str]] = {}
     for name, reason in found.passed:
         passed.setdefault(reason.removeprefix(name).lstrip(":, "), []).append(name)
@@ -141,15 +147,12 @@ def _refuse_goals(folder: Path, found: Survey) -> None:
     columns = {column.name: column.values for column in found.columns}
     if not any(name.startswith(lerobot.STATE) for name in columns):
         return
-    loops = ""
-    if found.of("time"):
-        loops = lerobot.describe_loops(found.of("time")[0].values, columns)
+    times = found.of("time")
+    loops = lerobot.describe_loops(times[0].values, columns) if times else ""
+    known = f"; what can be: each servo's own loop follows its goal late ({loops})" * bool(loops)
     raise InputError(
         "no effort, current or load is recorded: what moved the joints is not known, so that"
-        " inertia, weight and friction cannot be found"
-        + (
-            f"; what can be: each servo's own loop follows its goal late ({loops})" if loops else ""
-        ),
+        f" inertia, weight and friction cannot be found{known}",
         where=str(folder),
         remedy="record the servos' current or load with the state; or identify a loop with its load"
         " by a device file whose input is the goal: --device FILE",
@@ -244,7 +247,7 @@ def _check_robot(
 
 def _trials_tables(
     device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, timed: bool
-) -> list[str]:
+) -> Iterator[str]:
     """Propose the trials and their kinds; a long single record is cut at rests of its axis.
 
     Not where its rate is not known: then nobody can say after how many seconds.
@@ -254,26 +257,24 @@ def _trials_tables(
     cuts, where = _cuts(match) if alone else ([], "")
     if alone and axes and not cuts:
         cuts, where = guesses.stretches(match.t, next(iter(axes.values())).values), "at rests"
-    lines = []
     if cuts:
         note = match.notes.guess(f"one record, cut {where}, so that each part can be held out")
-        lines.append(note.strip())
+        yield note.strip()
     for trial in trials:
         for start_s, end_s in pairwise([None, *cuts, None]):
-            lines += ["[[trials]]", f"file = {quoted(trial.file)}"]
-            lines += _trial_kind(trial.file, device, match.notes)
+            yield from ("[[trials]]", f"file = {quoted(trial.file)}")
+            yield from _trial_kind(trial.file, device, match.notes)
             stretch = {"recording": trial.recording, "start_s": start_s, "end_s": end_s}
-            lines += [f"{key} = {value}" for key, value in stretch.items() if value is not None]
-            lines += [f"part = {quoted(trial.part)}"] if trial.part else []
+            yield from (f"{key} = {value}" for key, value in stretch.items() if value is not None)
+            yield from [f"part = {quoted(trial.part)}"] if trial.part else []
             for part in trial.parts:
                 if not any(name.startswith(f"{part.name}:") for name in match.used):
                     continue
-                lines += ["", "[[trials.parts]]"]
+                yield from ("", "[[trials.parts]]")
                 given = ("file", "name", "join", "time", "time_unit")
                 told = {key: getattr(part, key) for key in given}
-                lines += [f"{key} = {quoted(value)}" for key, value in told.items() if value]
-            lines.append("")
-    return lines
+                yield from (f"{key} = {quoted(value)}" for key, value in told.items() if value)
+            yield ""
 
 
 def _cuts(match: Matcher) -> tuple[list[float], str]:

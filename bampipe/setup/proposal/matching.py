@@ -165,6 +165,7 @@ class Matcher:
         for column in self.found.columns:
             known = column.name in self.used or column.role in _NEVER_DRIVES
             of_axis = column is position or column.si in ("rad", "m")
+            known |= column.is_integer and np.ptp(column.values) == 1.0  # a flag
             if known or column.is_constant or of_axis or asked & set(words(column.name)):
                 continue
             share[column.name] = self._share(position, column)

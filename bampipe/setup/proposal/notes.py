@@ -9,6 +9,7 @@ UNKNOWN = "?"
 """Stands for a column that could not be found."""
 COLUMNS = "see the headers of the logs, or ask who wrote the logger"
 """Where the name of a column is looked up."""
+UNDRIVEN = f"{COLUMNS}; what nothing drives shows ratios of inertia, weight and friction, no sizes"
 UNITS = "ask who wrote the logger, or see how far it moves; rad, deg, m and mm are usual"
 """Where the unit of a position is."""
 
@@ -39,9 +40,9 @@ class Notes:
             self.check.append(text)
         return f"  # guess: {text}"
 
-    def ask_column(self, name: str, unit: str) -> str:
+    def ask_column(self, name: str, unit: str, where: str = COLUMNS) -> str:
         """The comment on a column that could not be found, of what has that ``name``."""
-        return self.ask("the column of {}" + (unit and f" in {unit}"), COLUMNS, name)
+        return self.ask("the column of {}" + (unit and f" in {unit}"), where, name)
 
     def ask(self, text: str, where: str, of: str = "") -> str:
         """The comment that marks what a person must fill in, and where to look it up.

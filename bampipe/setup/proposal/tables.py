@@ -15,7 +15,7 @@ from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.matching import Match, Matcher
-from bampipe.setup.proposal.notes import UNITS, UNKNOWN, Notes, entry, quoted
+from bampipe.setup.proposal.notes import UNDRIVEN, UNITS, UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
 
 UNKNOWN_RATE = f'sample_rate_hz = "{UNKNOWN}"'
@@ -95,10 +95,12 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     named = f"column = {quoted(column.name)}"
     named_unit = next((u for u in ("us", "ms", "ns", "min") if u in words(column.name)), "")
     counter = not _COUNTERS.isdisjoint(words(column.name)) or column.role != "time"
-    counter &= not named_unit
+    plain = spelled(column.unit, tuple(SECONDS)) in SECONDS
+    counter &= not named_unit and not plain
     kind = "" if counter else guesses.time_unit(stamps + start, column.unit or named_unit)
-    tick = re.search(r"(?<!\d)(\d+) ?_?(ns|us|ms)(?![A-Za-z])", column.name)
-    if counter and tick:
+    written = f"{column.name} {column.unit}"
+    tick = re.search(r"(?<![\d.])(\d*\.?\d+) ?_?(ns|us|ms)(?![A-Za-z])", written)
+    if tick and (counter or (column.si == "s" and not plain)):
         size = float(tick[1]) * SECONDS[tick[2]]
         note = notes.guess(f"a count of {column.name} is {tick[0]}, by its name")
         lines = [named, 'unit = "ticks"', f"ticks_per_s = {1.0 / size:.10g}{note}"]
@@ -108,8 +110,8 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
         if counter:
             step = float(np.median(np.diff(stamps)))
             note = notes.ask(
-                f"ticks_per_s, what {column.name} counts in a second, and sample_rate_hz, a"
-                f" {step:.6g}th of it",
+                f"ticks_per_s, what {column.name} counts in a second, and sample_rate_hz, 1/"
+                f"{step:.6g} of it",
                 "the clock of the timer or processor, in its data sheet or firmware; else what it"
                 " counted over the seconds that the recording took",
             )
@@ -350,7 +352,8 @@ def input_tables(device: Device, axes: Mapping[str, SurveyedColumn], match: Matc
     if sensed and len(forces) in (0, len(device.forces)):
         match.used |= {column.name for column in forces}
         names = [column.name for column in forces] or [UNKNOWN] * len(device.forces)
-        ask = "" if forces else notes.ask_column(" and ".join(device.forces), device.force_unit)
+        missing = " and ".join(device.forces)
+        ask = "" if forces else notes.ask_column(missing, device.force_unit, UNDRIVEN)
         unit_of = [f'unit = "{device.force_unit}"']
         if forces:
             unit_of = _force_unit(device, forces, given[device.forces[0]][1], match.notes)
