@@ -422,20 +422,12 @@ class System:
             out[:, group.places] = group.integrate(module, along, start, self.inputs, parts, known)
         for column, place in enumerate(self.changes, len(self.memory_names)):
             for part in parts:
-                out[part, column] = _differentiate(out[part, place], t[part])
+                out[part, column] = np.gradient(out[part, place], t[part])
         return out
 
     @cached_property
     def _state_modules(self) -> dict[str, ModuleType]:
         return {group.module: self._code.module(group.module) for group in self.state_groups}
-
-
-def _differentiate(values: Array, t: Array) -> Array:
-    """Rate of change of samples (T,) by central differences of fourth order."""
-    found = np.gradient(values, t)
-    apart = (values[4:] - values[:-4]) / (t[4:] - t[:-4])
-    found[2:-2] = (4.0 * found[2:-2] - apart) / 3.0
-    return found
 
 
 def stack_columns(columns: Sequence[Any], rows: int) -> Array:

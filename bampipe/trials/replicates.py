@@ -259,9 +259,8 @@ def _required_force(fitted: ModelOnTrial, rate_hz: float) -> Array:
 def _cancel_residual(fitted: ModelOnTrial) -> Array:
     """Change the measured force by Newton steps until no residual is left, (T, n_f).
 
-    An effect that takes a part of the force requires more of it. A force that acts through an
-    internal state, such as a lag, has no instantaneous slope; one is assumed. What no force can
-    cancel stays, as where a gap is crossed.
+    An effect that takes a part of the force requires more of it. A force behind an internal state,
+    such as a lag, is assumed to have a slope. What no force can cancel stays, as in a gap.
     """
     system, motion, p = fitted.system, fitted.motion, fitted.p
     columns = force_columns(system)
