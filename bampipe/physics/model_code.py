@@ -95,7 +95,7 @@ def whole_code(model: Model) -> Generation:
 def moved_first(model: Model, e: Equations, forces: list[Any]) -> list[list[int]]:
     """Return, by axis, the places in a state of the position and rate that a force acts on first.
 
-    They are those of the axis, or internal states of a part that moves the axis through play.
+    They are those of the axis, or the first states of a part that moves the axis through play.
     """
     n = len(e.q)
     found = [[i, n + i] for i in range(n)]
@@ -105,7 +105,7 @@ def moved_first(model: Model, e: Equations, forces: list[Any]) -> list[list[int]
             place = e.z_names.index(f"{item.prefix}.{state.name}")
             if (rate := e.rates[place]) in e.z and e.rates[e.z.index(rate)].has(*forces):
                 axis = axes.index(item.axes[0])
-                if e.other_now[axis].has(e.z[place]):
+                if found[axis][0] == axis and e.other_now[axis].has(e.z[place]):
                     found[axis] = [2 * n + place, 2 * n + e.z.index(rate)]
     return found
 

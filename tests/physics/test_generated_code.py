@@ -75,7 +75,7 @@ def test_columns_and_functions_of_one_state_agree(device, effects):
     """The same residual, acceleration and reading from both, to 1e-12 of their size."""
     system = compile_model(Model(device, effects))
     printed = run_as_python(system, "derivative", "measure", "residual")
-    count, n = 40, len(system.coordinates)
+    count, n, states = 40, len(system.coordinates), len(system.memory_names)
     q, qd, qdd = random_motion(device, count, 21, speed=0.5)
     qd[::4] *= 1e-3
     u, z = random_inputs(system, count, 22), memory_within_reason(system, count, 23)
@@ -97,7 +97,6 @@ def test_columns_and_functions_of_one_state_agree(device, effects):
     added = system.contribution(q, qd, qdd, z, u, p)
     np.testing.assert_allclose(without + added, columns, atol=1e-12 * scale)
 
-    states = len(system.memory_names)
     x, w = np.hstack([q, qd, z[:, :states]]), np.zeros((count, len(system.noise)))
     rates, _ = rates_and_readings(printed, system, x, u, [p] * count, w)
     bends, z[:, states:] = rates[:, n : 2 * n], rates[:, [2 * n + k for k in system.changes]]

@@ -238,9 +238,10 @@ def test_what_is_loose_flies_free_for_as_long_as_it_crosses_half_the_gap(effect)
 
 
 def test_an_arm_leads_the_motor_that_moves_the_axis_through_play():
-    # Through the poses, the play of one axis appears in the equations of all.
+    # The play of one axis appears in the equations of all, the hand's force in its friction, too.
     for i, name in enumerate(("yaw", "pitch", "extension")):
-        through = compile_model(Model(registry.device("bam"), [f"backlash:{name}"])).moved_first
+        effects = [f"backlash:{name}", f"load_dependent_friction:{name}"]
+        through = compile_model(Model(registry.device("bam"), effects)).moved_first
         assert through.tolist() == [[6, 7] if k == i else [k, 3 + k] for k in range(3)]
     device = registry.device("slider")
     assert compile_model(Model(device, ["loose_load:carriage"])).moved_first.tolist() == [[0, 1]]
