@@ -20,7 +20,7 @@ def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
     """Effects in the order in which they act, whatever the order in which they were added.
 
     The order is link by link, then effects on the mechanism itself, last those on all dry friction,
-    weights or inertia; ties go by name.
+    weights or inertia, and behind them a mechanism ahead of its encoder; ties go by name.
     """
 
     def order_key(item: BoundEffect) -> tuple[int, bool, bool, str]:

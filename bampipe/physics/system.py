@@ -38,7 +38,7 @@ class System:
         coordinates, coordinate_units, torque_units: per generalised coordinate.
         states: names of the full state x: positions, rates, internal states.
         inputs: names of the columns of u. parameters: those in p, in order.
-        noise: names of the additive process noise w.
+        noise: names of the additive process noise w. changes: states whose rates `memory` appends.
         linear: per parameter, whether the residual is linear in it; of several, see `is_linear_in`.
         constant: per parameter, whether the slope of the residual by it depends on no parameter
             along the mechanism's true motion; unforced: and on no input.

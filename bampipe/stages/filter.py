@@ -230,7 +230,7 @@ def _nothing_to_differentiate(
 def _choose_kinematics(
     records: Mapping[str, list[tuple[Array, Flags]]], session: IngestResult, config: Config
 ) -> tuple[Kinematics, dict[str, dict[str, Any]]]:
-    """Return how to differentiate the trials, and by axis what a reader is told about it."""
+    """Return the settings for differentiating the trials, and each axis' entry in the result."""
     rate, filters, about = session.sample_rate_hz, {}, {}
     for axis, entry in session.axes.items():
         filters[axis], about[axis] = _choose(axis, records[axis], rate, entry.resolution, config)
