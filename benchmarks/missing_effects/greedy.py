@@ -29,7 +29,7 @@ from scipy.optimize import minimize
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import load_model, read_estimate, read_recipe
+from bampipe.declarations.model_file import load_model, read_estimate, read_spec
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Dictionary
 from bampipe.diagnosis.ranges import MachineScale
@@ -92,11 +92,11 @@ def search(session: Path, folder: Path) -> list[tuple[str, float]]:
     system = compile_model(model)
     timing = run.read(IdentifyResult, "base").input_timing
     trials = Session(read_measured_trials(run, system, every_input=True, timing=timing), Criteria())
-    recipe = read_recipe(run, "base", model)
-    fit = trials.fit_plainly(recipe, read_estimate(run, "base", system))
+    spec = read_spec(run, "base", model)
+    fit = trials.fit_plainly(spec, read_estimate(run, "base", system))
     e, samples = fit.linearisation, fit.likelihood.samples
-    names = trials.candidate_names(recipe)
-    candidates = {c.name: c for c in candidates_of(recipe, names)}
+    names = trials.candidate_names(spec)
+    candidates = {c.name: c for c in candidates_of(spec, names)}
     dictionary = Dictionary(e, samples, candidates, MachineScale.of_trials(e))
     weights = [1.0 / max(float(np.sqrt(np.mean(take_samples(e.residual, s, a) ** 2))), 1e-300)
                for a, s in enumerate(samples)]  # fmt: skip
