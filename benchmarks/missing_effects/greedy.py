@@ -127,7 +127,7 @@ def search(session: Path, folder: Path) -> list[tuple[str, float]]:
     while len(found) < MOST:
         tried = [(regression.error(x), name, k)
                  for name, columns in pool.items() for k, x in enumerate(columns)]  # fmt: skip
-        after, name, k = min(tried)
+        after, name, k = min(tried, default=(before, "", 0))
         if after >= before:
             break
         regression.x = np.column_stack([regression.x, pool.pop(name)[k]])
