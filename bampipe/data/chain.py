@@ -10,17 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
+from bampipe.data import robot_tree
 from bampipe.data.mjcf import mjcf_tree
-from bampipe.data.robot_tree import (
-    MOVING,
-    Body,
-    DriveLimits,
-    LumpedBodies,
-    Tree,
-    TreeJoint,
-    gravity_at,
-    identifier,
-)
+from bampipe.data.robot_tree import MOVING, LumpedBodies, Tree, TreeJoint, identifier
 from bampipe.data.robot_xml import read_xml
 from bampipe.data.urdf import urdf_tree
 from bampipe.errors import InputError, did_you_mean, located
@@ -55,7 +47,7 @@ class Chain:
     """
 
     joints: Mapping[str, dict[str, Any]]
-    limits: Mapping[str, DriveLimits]
+    limits: Mapping[str, robot_tree.DriveLimits]
     base: str
     tip: str
     notes: tuple[str, ...]
@@ -102,7 +94,7 @@ def read_chain(
         tree, held_still = _hold_followers(tree, tree.path(base, tip))
         joints = tree.path(base, tip)
         if payload is not None:
-            held = tree.bodies[tip].joined(Body.of_table(payload))
+            held = tree.bodies[tip].joined(robot_tree.Body.of_table(payload))
             tree = replace(tree, bodies={**tree.bodies, tip: held})
         moving = [joint for joint in joints if joint.kind != "fixed"]
         if not moving:
@@ -112,7 +104,9 @@ def read_chain(
         held_still += [joint.name for start in moving for joint in lumped.held_on(start.child)]
         if held_still:
             notes = (f"held at zero beside the chain: {join_names(held_still, _MANY)}", *notes)
-        return Chain(_tables(joints, lumped), limits, base, tip, notes, *gravity_at(tree, base))
+        return Chain(
+            _tables(joints, lumped), limits, base, tip, notes, *robot_tree.gravity_at(tree, base)
+        )
 
 
 def _hold_followers(tree: Tree, path: Sequence[TreeJoint]) -> tuple[Tree, list[str]]:

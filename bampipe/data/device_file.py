@@ -78,9 +78,7 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
             where=where,
             remedy='choose a part: base = "..." and tip = "..." in [robot]',
         )
-    kinds = {
-        joint: str(entry.get("kind")) for joint, entry in joints.items() if not entry.get("follows")
-    }
+    kinds = {j: str(entry.get("kind")) for j, entry in joints.items() if not entry.get("follows")}
     if not set(kinds.values()) <= set(_UNITS):
         return table
     motors = robot.get("motors", {})
@@ -242,11 +240,9 @@ def _filled(
                     f"{ratio}*(viscous_{name}*({speed}) + coulomb_{name}*sgn({speed}))"
                 )
     found: dict[str, Any] = {
-        "coordinates": {
-            joint: {"kind": "linear" if joint in slides else "rotary"} for joint in kinds
-        },
+        "coordinates": {j: {"kind": "linear" if j in slides else "rotary"} for j in kinds},
         "inputs": {
-            "force": list(channel.values()),
+            "force": [*channel.values()],
             "force_unit": "A" if by_current else "N.m",
             "drive": True,
         },

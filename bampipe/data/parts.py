@@ -12,7 +12,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
-from bampipe.data.readers.trial import Dialect, RawTrial
+from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import MOST_APART
 from bampipe.data.session import SECONDS, Part, TrialEntry
 from bampipe.data.session.channels import TimeUnit
@@ -188,9 +188,7 @@ def _read_clock(
     times = [column for column, unit in columns.items() if role(column, unit) == "time"]
     datetimes = {column: "" for column in times if columns[column] == "datetime"}
     wanted = times or list(columns)[:1]
-    raw: RawTrial = read_trial(
-        folder / name, wanted, name=name, datetimes=datetimes, dialect=dialect
-    )
+    raw = read_trial(folder / name, wanted, name=name, datetimes=datetimes, dialect=dialect)
     for column in times:
         stamps = raw.columns[column]
         known = stamps[np.isfinite(stamps)]

@@ -92,11 +92,7 @@ def _without_codes(raw: RawTrial, clock: Clock) -> RawTrial:
     columns, notes = dict(raw.columns), list(raw.notes)
     names = sorted(columns.keys() - {clock.column, clock.nanoseconds})
     zero = np.all([columns[name] == 0.0 for name in names], axis=0)
-    if (
-        len(names) > 1
-        and 0 < zero.sum() < zero.size
-        and all(_leaps(columns[n], zero) for n in names)
-    ):
+    if names[1:] and 0 < zero.sum() < zero.size and all(_leaps(columns[n], zero) for n in names):
         columns |= {name: np.where(zero, np.nan, columns[name]) for name in names}
         notes.append(f"{zero.sum()} rows of zeros, to which all readings leap, are taken for none")
     for name in names:

@@ -113,7 +113,7 @@ class SampleStream:
     _last_good: int = 0
     _delimiter: str = ","
     _width: int = 0
-    _indices: tuple[int, ...] = ()
+    _places: tuple[int, ...] = ()
     _last: float = -np.inf
 
     @property
@@ -173,7 +173,7 @@ class SampleStream:
                 remedy=f"the columns must be {', '.join(wanted)}",
             )
         self._layout, self._width, self._last_good = fitting[0], len(found), self._line
-        self._indices = tuple(found.index(name) for name in fitting[0].columns)
+        self._places = tuple(found.index(name) for name in fitting[0].columns)
 
     def _samples(self, rows: Mapping[int, list[float]], layout: StreamLayout) -> Array:
         """The samples of rows of numbers, by number of the line."""
@@ -211,10 +211,8 @@ class SampleStream:
             self._skip(self._line, "", f"{len(cells)} cells where the header has {self._width}")
             return []
         row = []
-        for index, column, may_lack in zip(
-            self._indices, layout.columns, layout.may_lack, strict=True
-        ):
-            text = cells[index].strip().strip("\"'")
+        for at, column, may_lack in zip(self._places, layout.columns, layout.may_lack, strict=True):
+            text = cells[at].strip().strip("\"'")
             try:
                 # float() also reads 1_0 and the digits of other scripts, which no logger writes.
                 if "_" in text or not text.isascii():

@@ -217,13 +217,11 @@ class Comparison:
                 np.hstack([motion.change @ turns, rate, np.tanh(rate / width)])
                 for motion, rate in zip(self.motions, rates, strict=True)
             ]
-            thinned = self._thinned(columns, k)
-            _, rate, sign = np.split(thinned, 3, axis=1)
+            rows = self._thinned(columns, k)
+            _, rate, sign = np.split(rows, 3, axis=1)
             means = [part.sum(axis=0) / max(len(part), 1) for part in (rate**2, sign * rate)]
             powers = np.concatenate([np.zeros(turns.shape[1]), *means])
-            found.append(
-                Losses.of(thinned, powers, self._rows(self.drives[:, k], k), self.has_offset)
-            )
+            found.append(Losses.of(rows, powers, self._rows(self.drives[:, k], k), self.has_offset))
         return found
 
     def hold(self, mounting: Mounting, bounds: Bounds = WIDE) -> list[Drive]:

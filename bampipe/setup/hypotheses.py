@@ -12,6 +12,7 @@ from bampipe.data import units
 from bampipe.results.setup import Kind
 from bampipe.trials.signals import Change, Signals
 
+_Units = tuple[str, str]
 CONFUSED = {
     "rad": ("deg", "rev", "mrad"),
     "m": ("mm", "cm", "um", "in"),
@@ -66,11 +67,7 @@ def combine(signals: Signals, corrections: Sequence[Correction]) -> Change:
 
 
 def scale_correction(
-    signals: Signals,
-    names: Sequence[str],
-    factor: float,
-    cost: float,
-    units: tuple[str, str] = ("", ""),
+    signals: Signals, names: Sequence[str], factor: float, cost: float, units: _Units = ("", "")
 ) -> Correction:
     """Signals ``names`` must be multiplied by ``factor``."""
     change, places = Change.none(len(signals.names)), signals.places(names)
@@ -109,9 +106,7 @@ def nearest_scale_correction(signals: Signals, names: Sequence[str], factor: flo
     return scale_correction(signals, names, *nearest)
 
 
-def _usual_scales(
-    signals: Signals, names: Sequence[str]
-) -> Iterator[tuple[float, float, tuple[str, str]]]:
+def _usual_scales(signals: Signals, names: Sequence[str]) -> Iterator[tuple[float, float, _Units]]:
     """Yield factor, cost, and (meant, stated) of units that are mistaken for others, and gains."""
     place = signals.places(names)[0]
     si, stated = signals.units[place], signals.stated[place]

@@ -77,9 +77,7 @@ def inspect_setup(
         *_record_turned(system, session, odd, names),
         *(_record(system, session, found, placeholders) for found in findings),
     )
-    axes = {
-        axis: _axis(place, axis, held, mistakes) for place, axis in enumerate(system.coordinates)
-    }
+    axes = {axis: _axis(k, axis, held, mistakes) for k, axis in enumerate(system.coordinates)}
     warnings = [
         f"{axis} hardly moves: it stands still in {100.0 * (1.0 - entry.moving_share):.0f} % of the"
         " samples, so its parameters are poorly determined"
@@ -175,8 +173,7 @@ def _record(
         error_before=errors(found.before),
         error_after=errors(found.after),
         alternatives=tuple(
-            PossibleMistake.of(rival, sentence=describe_correction(rival, session))
-            for rival in rivals
+            PossibleMistake.of(one, sentence=describe_correction(one, session)) for one in rivals
         ),
     )
 

@@ -10,29 +10,12 @@ from bampipe.arrays import Array
 from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.physics.robot import Robot
-from bampipe.setup import hypotheses
-from bampipe.setup.drawn_bodies import (
-    STATED,
-    Comparison,
-    Drive,
-    JointMotion,
-    find_heavy,
-    keep,
-    with_heavier_body,
-)
+from bampipe.setup import drawn_bodies, hypotheses, search
+from bampipe.setup.drawn_bodies import Comparison, Drive, JointMotion
 from bampipe.setup.hypotheses import Correction
 from bampipe.setup.mounting import Mounting
 from bampipe.setup.plausibility import FARTHEST, WEIGHT, Plausibility
-from bampipe.setup.search import (
-    DECADES,
-    LEAST_GAIN,
-    MOST_AXES,
-    Corrections,
-    Family,
-    Search,
-    gear_families,
-    scale_by_power_of_ten,
-)
+from bampipe.setup.search import Corrections
 from bampipe.trials.residuals import standstill_of
 from bampipe.trials.signals import Change
 
@@ -63,7 +46,7 @@ def drawn_robot(system: System) -> Robot:
 
 
 @dataclass
-class DrawnSearch(Search):
+class DrawnSearch(search.Search):
     """Tests set-ups against drawn bodies.
 
     Fitted bodies would absorb much of a mistake. Besides, each drive has an inertia and friction of
@@ -77,17 +60,17 @@ class DrawnSearch(Search):
         """Drives and the drawn bodies' forces, as stated except for a body that is too heavy."""
         bodies = self._nominal_bodies
         if self.system.model.device.force_unit != "A":
-            self.heavier = find_heavy(bodies, bodies.nominal)
+            self.heavier = drawn_bodies.find_heavy(bodies, bodies.nominal)
         if self.heavier is None:
             return bodies
-        return replace(bodies, robot=with_heavier_body(bodies.robot, self.heavier))
+        return replace(bodies, robot=drawn_bodies.with_heavier_body(bodies.robot, self.heavier))
 
     @cached_property
     def roughly(self) -> Comparison:
         """`stated` at thinned samples only: joints move more slowly than the band's cut-off."""
         kept = [self.band.thinned_rows(len(motion.t)) for motion in self.motions]
         motions = [m.rows(rows) for m, rows in zip(self.stated.motions, kept, strict=True)]
-        return replace(self.stated, motions=motions, thin=keep, _required={})
+        return replace(self.stated, motions=motions, thin=drawn_bodies.keep, _required={})
 
     @cached_property
     def _nominal_bodies(self) -> Comparison:
@@ -153,7 +136,7 @@ class DrawnSearch(Search):
     def is_suspicious(self, now: Plausibility | None) -> bool:
         if now is None:
             return False
-        return now.worst_error > _SUSPICIOUS or float(now.objections.sum()) > LEAST_GAIN
+        return now.worst_error > _SUSPICIOUS or float(now.objections.sum()) > search.LEAST_GAIN
 
     def rivals(self, tried: list[Correction]) -> list[Correction]:
         down = [-g for g in self.stated.robot.gravity]
@@ -165,9 +148,7 @@ class DrawnSearch(Search):
 
     def discrete(self) -> Iterator[Correction]:
         coupled = {force for force in self.signals.forces if force not in self._alone}
-        yield from (
-            one for one in hypotheses.sign_corrections(self.signals) if coupled & set(one.signals)
-        )
+        yield from (x for x in hypotheses.sign_corrections(self.signals) if coupled & {*x.signals})
         axes = set(self.signals.axes)
         for correction in (
             *hypotheses.exchange_corrections(self.signals),
@@ -177,17 +158,17 @@ class DrawnSearch(Search):
             # The share shows the unit of a drive, unless the drive turns several joints.
             of_drive = correction.kind == "scale" and not (axes | coupled) & set(correction.signals)
             cycle = correction.kind == "exchange" and len(correction.signals) > 2
-            if not (of_drive or (cycle and len(axes) > MOST_AXES)):
+            if not (of_drive or (cycle and len(axes) > search.MOST_AXES)):
                 yield correction
 
-    def families(self, chosen: Corrections) -> Iterator[tuple[Family, Array]]:
+    def families(self, chosen: Corrections) -> Iterator[tuple[search.Family, Array]]:
         position = np.concatenate([motion.position for motion in self.stated.motions])
         for axis, turns, q in zip(self.signals.axes, self.stated.turning, position.T, strict=True):
             if turns:
-                yield from gear_families(self.signals, axis, float(np.ptp(q)))
+                yield from search.gear_families(self.signals, axis, float(np.ptp(q)))
         for force in self.signals.forces:
             if force not in self._alone:
-                yield partial(scale_by_power_of_ten, self.signals, (force,)), DECADES
+                yield partial(search.scale_by_power_of_ten, self.signals, (force,)), search.DECADES
 
     def together(self, chosen: Corrections) -> Corrections:
         # Add the mistakes that the best mounting and the drives' shares show.
@@ -233,7 +214,7 @@ class DrawnSearch(Search):
             yield hypotheses.nearest_scale_correction(self.signals, forces, factor)
             return
         for name, size in sizes.items():
-            if abs(size) > np.log(STATED[1]):
+            if abs(size) > np.log(drawn_bodies.STATED[1]):
                 yield hypotheses.nearest_scale_correction(self.signals, [name], np.exp(-size))
 
     def _compare(self, change: Change, stated: Comparison) -> Comparison | None:
@@ -267,7 +248,7 @@ class DrawnSearch(Search):
         gravity = np.array(change.gravity or compared.robot.gravity)
         mounting = Mounting(np.ones(n), change.offset[:n], gravity, change.gravity is not None)
         with np.errstate(all="ignore"):
-            drives = compared.hold(mounting, STATED)
+            drives = compared.hold(mounting, drawn_bodies.STATED)
         if not np.isfinite([drive.left for drive in drives]).all():
             return None
         return compared, mounting, drives

@@ -369,10 +369,8 @@ def scale_by_power_of_ten(signals: Signals, names: tuple[str, ...], power: float
 def gear_families(signals: Signals, axis: str, travel: float) -> Iterator[tuple[Family, Array]]:
     """Yield gear ratios of an axis whose position, with that travel, rad, must be a motor's."""
     if travel > hypotheses.MOST_TRAVEL:
-        yield (
-            partial(scale_by_power_of_ten, signals, (axis,)),
-            np.log10(hypotheses.JOINT_SPANS / travel),
-        )
+        spans = hypotheses.JOINT_SPANS / travel
+        yield partial(scale_by_power_of_ten, signals, (axis,)), np.log10(spans)
 
 
 def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signals) -> bool:

@@ -7,18 +7,11 @@ import numpy as np
 
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
+from bampipe.setup import search
 from bampipe.setup.hypotheses import Correction, sign_correction
 from bampipe.setup.plausibility import Plausibility, judge_setup
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, is_drawn
-from bampipe.setup.search import (
-    ALIKE,
-    LEAST_GAIN,
-    MOST_AXES,
-    SUSPICIOUS_ERROR,
-    Finding,
-    gain_of,
-    shorten,
-)
+from bampipe.setup.search import ALIKE, LEAST_GAIN, Finding, gain_of
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
@@ -40,10 +33,10 @@ def find_turned_trials(
     fitted = folds.fitted_trials
     if len(fitted) < 2:
         return {}
-    if len(system.coordinates) > MOST_AXES:
+    if len(system.coordinates) > search.MOST_AXES:
         if not is_drawn(system):
             return {}
-        short = {k: shorten([motions[k]], DRAWN_SAMPLES) for k in fitted}
+        short = {k: search.shorten([motions[k]], DRAWN_SAMPLES) for k in fitted}
         return _find_by_drawn_bodies(
             {k: DrawnSearch(system, m, band, folds.subset([k]), signals) for k, m in short.items()}
         )
@@ -51,15 +44,15 @@ def find_turned_trials(
     def gain(own: Plausibility, other: Plausibility) -> float:
         found = gain_of(own, other, 0.0)
         worse = own if found > 0.0 else other
-        return found if worse.error.max() >= SUSPICIOUS_ERROR else 0.0
+        return found if worse.error.max() >= search.SUSPICIOUS_ERROR else 0.0
 
     def fit(k: int, one: Correction | None = None) -> Plausibility | None:
-        (motion,) = shorten([motions[k]], _SAMPLES)
+        (motion,) = search.shorten([motions[k]], _SAMPLES)
         way = one.change.of_motion(motion, signals) if one else motion
         return judge_setup(system, [way], band, folds.subset([k]), _STEPS)
 
     stated = {k: own for k in fitted if (own := fit(k)) is not None}
-    if all(own.error.max() < SUSPICIOUS_ERROR for own in stated.values()):
+    if all(own.error.max() < search.SUSPICIOUS_ERROR for own in stated.values()):
         return {}
     drives = [name for name in signals.inputs if name not in signals.brakes]
     options = [sign_correction(signals, [name]) for name in (*signals.axes, *drives)]
@@ -89,13 +82,13 @@ def find_turned_trials(
 
 def _find_by_drawn_bodies(alone: Mapping[int, DrawnSearch]) -> dict[int, Finding]:
     """Find the few trials, each searched alone, in which a drive opposes bodies and friction."""
-    against = {k: search.drives_against_bodies() for k, search in alone.items()}
+    against = {k: own.drives_against_bodies() for k, own in alone.items()}
     often = Counter(name for names in against.values() for name in names)
     found = {}
-    for k, search in alone.items():
+    for k, own in alone.items():
         if names := [name for name in against[k] if 2 * often[name] < len(alone)]:
-            one = sign_correction(search.signals, names)
-            before, after = search.judge(()), search.judge((one,))
+            one = sign_correction(own.signals, names)
+            before, after = own.judge(()), own.judge((one,))
             gain = gain_of(before, after, 0.0) if before and after else 0.0
             if before and after and gain > LEAST_GAIN:
                 found[k] = Finding(one, (), before, after, gain)

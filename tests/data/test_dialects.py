@@ -39,12 +39,8 @@ def check(trial, columns=("t", "x", "n")):
 
 PREAMBLE = "LabVIEW Measurement\nOperator;A. B.\n\n"
 WRITTEN = {
-    "plain": table(),
-    "semicolons": table(";"),
-    "semicolons, decimal commas": table(";", ","),
-    "tabs, decimal commas": table("\t", ","),
-    "bars": table("|"),
-    "blanks": table(" "),
+    "plain": table(), "semicolons": table(";"), "semicolons, decimal commas": table(";", ","),
+    "tabs, decimal commas": table("\t", ","), "bars": table("|"), "blanks": table(" "),
     "several blanks": table(" ", row=lambda c: "  " + "   ".join(c) + " "),
     "blanks, decimal commas": table(" ", ","),
     "blanks and tabs": table(" ", row=" \t ".join),
@@ -70,7 +66,7 @@ WRITTEN = {
     "a column of text with commas": table(
         ";", header="t,x,n,note", row=lambda c: ";".join([*c, "slow, 1,5 turns"])
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", WRITTEN)

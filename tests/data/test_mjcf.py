@@ -87,9 +87,7 @@ def test_limits_and_losses_are_heard(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("motors", "ratio"), [("", 1.0), ("[robot.motors.m]\n", 10.0)])
-def test_losses_and_armature_are_where_estimates_start(
-    tmp_path: Path, motors: str, ratio: float
-) -> None:
+def test_estimates_start_at_losses_and_armature(tmp_path: Path, motors: str, ratio: float) -> None:
     file = write(tmp_path, ARM.format(**DEGREES))
     if motors:
         others = "".join(f"[robot.motors.{j}]\nturns = {{ {j} = 1 }}\n" for j in ("bend", "reach"))

@@ -64,12 +64,9 @@ def test_a_sound_trial_comes_through_untouched():
 
 def test_a_force_of_several_columns_is_their_weighted_sum():
     force = {
-        "columns": ["volts", "pulse"],
-        "components": ["motor"],
-        "unit": "V",
-        "calibration_n_per_v": [[35.0, 1.0]],
-        "zero_v": [0.1, 0.0],
-    }
+        "columns": ["volts", "pulse"], "components": ["motor"], "unit": "V",
+        "calibration_n_per_v": [[35.0, 1.0]], "zero_v": [0.1, 0.0],
+    }  # fmt: skip
     table = columns()
     table["volts"] = table.pop("force_x")
     table["pulse"] = np.where(np.arange(N) % 200 < 100, 40.0, 0.0)

@@ -47,16 +47,13 @@ def test_json_that_is_no_json_is_named(tmp_path, content, said):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"a = 1\nb = = 2\n", "line 2"),
-        (b"a = 1\n\xff = 2\n", "line 2: not UTF-8"),
-        (b"a = 2026-13-45\n", "line 1: not TOML"),
-        (b"a = " + b"9" * 5000, "not TOML"),
-        ("a = 1\n".encode("utf-16"), "UTF-16"),
-        (b"a = " + b"[" * 50_000, "nested too deeply"),
+        (b"a = 1\nb = = 2\n", "line 2"), (b"a = 1\n\xff = 2\n", "line 2: not UTF-8"),
+        (b"a = 2026-13-45\n", "line 1: not TOML"), (b"a = " + b"9" * 5000, "not TOML"),
+        ("a = 1\n".encode("utf-16"), "UTF-16"), (b"a = " + b"[" * 50_000, "nested too deeply"),
         (b".".join([b"a"] * 5_000) + b" = 1", "nested too deeply"),
         (b"#" * (files.LARGEST_TOML_BYTES + 1), "larger than 4 MB"),
     ],
-)
+)  # fmt: skip
 def test_toml_that_is_broken_is_named_with_its_line(tmp_path, content, message):
     path = tmp_path / "x.toml"
     path.write_bytes(content)

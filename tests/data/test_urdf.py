@@ -52,14 +52,10 @@ def device_of(folder: Path, tables: str = "", parts: tuple[str, ...] | None = No
 
 
 ARM = (
-    link("base"),
-    link("upper", 2.0, x=0.25),
-    link("lower", 1.0, x=0.25, yaw=np.pi / 2),
-    link("tool", 0.5),
-    joint("shoulder-pan", "base", "upper", x=0.0),
-    joint("elbow", "upper", "lower"),
-    joint("flange", "lower", "tool", "fixed"),
-)
+    link("base"), link("upper", 2.0, x=0.25), link("lower", 1.0, x=0.25, yaw=np.pi / 2),
+    link("tool", 0.5), joint("shoulder-pan", "base", "upper", x=0.0),
+    joint("elbow", "upper", "lower"), joint("flange", "lower", "tool", "fixed"),
+)  # fmt: skip
 
 
 def test_a_chain_is_read_with_what_is_fixed_to_it_and_held_beside_it(tmp_path: Path) -> None:
@@ -160,9 +156,7 @@ def test_damaged_files_are_refused(text: str, what: str, tmp_path: Path) -> None
         ((link("a"), link("b", mass=1e300), joint("j", "a", "b")), "joints.j: a body beyond"),
     ],
 )
-def test_what_cannot_be_computed_is_one_line(
-    parts: tuple[str, ...], what: str, tmp_path: Path
-) -> None:
+def test_what_cannot_be_read_is_one_line(parts: tuple[str, ...], what: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=what) as caught:
         check_device(device_of(tmp_path, parts=parts))
     assert not caught.value.others and "\n" not in str(caught.value)

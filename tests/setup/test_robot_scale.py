@@ -29,11 +29,9 @@ OFF = np.array([1.15, 0.9, 1.2, 0.85])
 Drawn = tuple[float, float, float]
 DOWN: Drawn = (0.0, 0.0, -9.81)
 SHARED = {
-    "m1": {"turns": {"one": 1.0}},
-    "m2": {"turns": {"two": 1.0}},
-    "m3": {"turns": {"three": 45.0}},
+    "m1": {"turns": {"one": 1.0}}, "m2": {"turns": {"two": 1.0}}, "m3": {"turns": {"three": 45.0}},
     "m4": {"turns": {"three": 32.0, "four": 32.0}},
-}
+}  # fmt: skip
 """Motors of which the last one turns two joints, as those of a wrist do."""
 
 

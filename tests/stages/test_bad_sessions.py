@@ -222,7 +222,7 @@ REFUSED: dict[str, tuple[Damage, str]] = {
     ),
     "axis name with a blank": (
         put("encoders.my axis", {"column": "a", "unit": "m"}),
-        "expected a name of letters, digits",
+        "expected letters, digits",
     ),
     "no trials": (put("trials", []), "expected at least 1 in the list"),
     "unknown kind": (put("trials.0.kind", "fre"), "did you mean 'free'"),

@@ -50,15 +50,11 @@ def joint(torque: str, travel: float, seed: int = 0) -> tuple[np.ndarray, np.nda
 @pytest.mark.parametrize(
     ("torque", "travel", "reading"),
     [
-        ("nothing", 1.2, "nothing"),
-        ("weight", 1.2, "gravity"),
-        ("weight", 0.2, "either"),
-        ("spring", 1.2, "spring"),
-        ("spring", 0.2, "either"),
-        ("weight and cable", 1.0, "both"),
+        ("nothing", 1.2, "nothing"), ("weight", 1.2, "gravity"), ("weight", 0.2, "either"),
+        ("spring", 1.2, "spring"), ("spring", 0.2, "either"), ("weight and cable", 1.0, "both"),
         ("weight and ripple", 0.6, "both"),
     ],
-)
+)  # fmt: skip
 def test_what_follows_the_angle_is_read_by_what_explains_it(
     torque: str, travel: float, reading: str, seed: int
 ) -> None:

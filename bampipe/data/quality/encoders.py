@@ -155,9 +155,7 @@ def check_velocity(table: TrialTable, encoder: Encoder) -> None:
             remedy="check the units and signs of both in session.toml",
         )
     if not 0.95 < ratio < 1.05:
-        table.notes.append(
-            f"column '{column}' is {ratio:.3g} times the change of '{encoder.column}'"
-        )
+        table.notes.append(f"'{column}' is {ratio:.3g} times the change of '{encoder.column}'")
 
 
 def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> None:

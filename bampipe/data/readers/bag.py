@@ -21,16 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bampipe.data.readers import moments
+from bampipe.data.readers import moments, trial
 from bampipe.data.readers.nested import MISSING, as_number, find, items, leaves, names_in, spread
-from bampipe.data.readers.trial import (
-    RawTrial,
-    Wanted,
-    check_columns,
-    check_size,
-    interpolated,
-    need,
-)
+from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size, need
 from bampipe.errors import InputError
 
 RECORDED = "@time"
@@ -136,7 +129,7 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
         else:
             at, since = ((x - base[0]) / moments.NANOSECONDS for x in (base, times[stream]))
             cells = np.array(stream.cells[column], dtype=np.float64)
-            values[column] = interpolated(at, since, cells)
+            values[column] = trial.interpolated(at, since, cells)
     remarks = [_left_out(topic, streams, times) for topic in {s.topic for s in times}]
     for stream in times:
         if stream is not leading:
@@ -168,9 +161,7 @@ def _read_streams(path: Path, fields: Mapping[str, Field], wanted: Wanted) -> li
     for column, each in fields.items():
         if not each.is_time and all(column not in s.cells for s in streams.values()):
             raise InputError(
-                f"no field '{each.path}'",
-                where=f"column '{column}'",
-                remedy=f"it has {near:.200}",
+                f"no field '{each.path}'", where=f"column '{column}'", remedy=f"it has {near:.200}"
             )
     return list(streams.values())
 

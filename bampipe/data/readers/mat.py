@@ -54,8 +54,7 @@ def _is_level_5(path: Path) -> bool:
     if len(head) >= _HEADER and head[126:128] in (b"IM", b"MI"):
         return True
     raise InputError(
-        "not a MATLAB file of version 5 or newer",
-        remedy="save it again from MATLAB (-v7)",
+        "not a MATLAB file of version 5 or newer", remedy="save it again from MATLAB (-v7)"
     )
 
 

@@ -33,15 +33,13 @@ def is_moment(cell: str) -> bool:
     return known or bool(_MOMENT.match(cell) or _OF_DAY.match(cell))
 
 
-def nanoseconds(
-    values: Sequence[str | None] | np.ndarray, form: str, first_row: int = 1
-) -> np.ndarray:
+def nanoseconds(values: Sequence[str | None] | np.ndarray, form: str, row: int = 1) -> np.ndarray:
     """Moments as whole nanoseconds since 1970 (UTC), (T,) int64; the least one where missing.
 
     Args:
         values: text, or numpy datetime64.
         form: as of ``strptime``; "" for ISO 8601 or times of day, which are of 1970-01-01.
-        first_row: number of the first row, for messages.
+        row: number of the first row, for messages.
 
     Raises:
         InputError: a cell is no date and time of that form.
@@ -69,7 +67,7 @@ def nanoseconds(
     if wrong.any():
         at = int(np.argmax(wrong))
         raise InputError(
-            f"row {first_row + at}: found '{str(text.iloc[at])[:40]}', expected a date and time"
+            f"row {row + at}: found '{str(text.iloc[at])[:40]}', expected a date and time"
             + (f" like {form}" if form else " like 2026-10-03T10:12:00.125"),
             remedy="" if form else 'give its form: format = "%d.%m.%Y %H:%M:%S.%f" under [time]',
         )

@@ -145,8 +145,7 @@ def aligned(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
     for column, value in values.items():
         if len(value) not in (1, count):
             raise InputError(
-                f"{len(value)} values, where '{first}' has {count}",
-                where=f"{what} '{column}'",
+                f"{len(value)} values, where '{first}' has {count}", where=f"{what} '{column}'"
             )
     return {c: np.repeat(v, count) if len(v) == 1 < count else v for c, v in values.items()}
 
@@ -179,6 +178,5 @@ def need(module: str, extra: str) -> ModuleType:
     except ImportError as error:
         package = module.partition(".")[0]
         raise InputError(
-            f"this needs {package}, which is not installed",
-            remedy=f"pip install 'bampipe[{extra}]'",
+            f"needs {package}, which is not installed", remedy=f"pip install 'bampipe[{extra}]'"
         ) from error

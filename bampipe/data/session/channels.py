@@ -10,19 +10,10 @@ from typing import Annotated, Literal, NamedTuple, get_args
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from bampipe import schema
 from bampipe.data import units
 from bampipe.errors import InputError, did_you_mean
-from bampipe.schema import (
-    Declaration,
-    Distinct,
-    NamedDeclaration,
-    NotNegative,
-    Number,
-    Positive,
-    Several,
-    Text,
-    fault,
-)
+from bampipe.schema import Declaration, Distinct, NamedDeclaration, Number, Several, fault
 
 LARGEST_CONDITION = 1e8
 """A calibration matrix with a larger condition number counts as singular."""
@@ -34,9 +25,7 @@ SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.
 
 def _name(text: str) -> str:
     if re.fullmatch("[A-Za-z][A-Za-z0-9_]{0,59}", text) is None:
-        raise fault(
-            f"found {json.dumps(text)}, expected a name of letters, digits and '_', a letter first"
-        )
+        raise fault(f"found {json.dumps(text)}, expected letters, digits and '_', a letter first")
     return text
 
 
@@ -55,9 +44,9 @@ def _filled_in(column: str) -> str:
 
 
 Column = Annotated[
-    Text,
+    schema.Text,
     AfterValidator(_filled_in),
-    Field(description="A column (or MATLAB variable) of the trial files"),
+    Field(description="A column (or variable) of the trial files"),
 ]
 Uncertainty = Annotated[float, Field(ge=0, lt=1)]
 SignBit = Annotated[
@@ -99,7 +88,7 @@ class Clock(Declaration):
     unit: Literal[TimeUnit, "samples", "ticks"]
     """datetime: dates and times; samples: no column, one sample each 1/sample_rate_hz; ticks: of a
     counter, see ticks_per_s"""
-    ticks_per_s: Positive | None = Field(
+    ticks_per_s: schema.Positive | None = Field(
         default=None, description='Rate of the counter, 1/s, where unit = "ticks"'
     )
     format: str = ""
@@ -165,7 +154,7 @@ class Encoder(NamedDeclaration):
     """Standard uncertainty of its scale, as a share: 0.001 for 0.1 %"""
     velocity: Velocity | None = None
     """A velocity recorded beside it: checks unit and sign of the position"""
-    stated_resolution: Positive | None = Field(default=None, alias="resolution")
+    stated_resolution: schema.Positive | None = Field(default=None, alias="resolution")
     """Smallest step of a column that is not in counts, in its unit"""
     sign_bit: SignBit = None
     also_reads: dict[ChannelName, Number] = Field(default={})
@@ -242,9 +231,7 @@ class Encoder(NamedDeclaration):
                 " units",
             )
         if self.stated_resolution is not None:
-            yield InputError(
-                "given beside counts_per_unit, which sets it already", where="resolution"
-            )
+            yield InputError("given beside counts_per_unit, which sets it", where="resolution")
 
 
 class Force(Declaration):
@@ -261,7 +248,7 @@ class Force(Declaration):
     raw_unit: Annotated[str, _unit_of("N", "N.m", "V")] = Field(
         alias="unit", description="Of the columns, such as kN or mN.m; only V needs a calibration"
     )
-    lever: NotNegative | None = Field(default=None, alias="lever_m")
+    lever: schema.NotNegative | None = Field(default=None, alias="lever_m")
     """Distance from the axis at which a force acts, m: makes a torque in N.m of it"""
     reaction: bool = False
     """The sensor shows what the machine exerts, as one at the foot of a motor or a brake does: its
@@ -277,7 +264,7 @@ class Force(Declaration):
     """Standard uncertainty of each component's gain, as a share: 0.01 for 1 %"""
     crosstalk_sd: Uncertainty = 0.0
     """Standard uncertainty of how much of another component each one shows, as a share"""
-    noise_sd: NotNegative | None = Field(default=None, alias="noise_sd_n")
+    noise_sd: schema.NotNegative | None = Field(default=None, alias="noise_sd_n")
     """Standard deviation at rest, after calibration"""
 
     @property
@@ -338,9 +325,7 @@ class Force(Declaration):
                     remedy='name the components: components = ["x", ...]',
                 )
         if self.lever is not None and self._calibrated_unit != "N":
-            yield InputError(
-                f'given although unit = "{self.raw_unit}" is a torque already', where="lever_m"
-            )
+            yield InputError(f'unit = "{self.raw_unit}" is a torque already', where="lever_m")
         if self.lever == 0.0:
             yield InputError(
                 "found 0, expected the distance in m from the axis at which the force acts",
@@ -360,8 +345,7 @@ class Force(Declaration):
                 )
         if self.volts and self.zero_v is not None and len(self.zero_v) != columns:
             yield InputError(
-                f"found {len(self.zero_v)}, expected {columns} numbers, one a column",
-                where="zero_v",
+                f"found {len(self.zero_v)}, expected {columns}, one a column", where="zero_v"
             )
         if self.volts and self.calibration_n_per_v is not None:
             rows = self.calibration_n_per_v

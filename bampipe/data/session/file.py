@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, StringConstraints
 
+from bampipe import schema
 from bampipe.data.readers.trial import Dialect
 from bampipe.data.session.channels import (
     SECONDS,
@@ -27,19 +28,7 @@ from bampipe.data.session.channels import (
 )
 from bampipe.errors import InputError, did_you_mean
 from bampipe.files import is_inside, read_toml
-from bampipe.schema import (
-    ByName,
-    Declaration,
-    Distinct,
-    NamedDeclaration,
-    NotNegative,
-    Positive,
-    Several,
-    Text,
-    checked_by,
-    fault,
-    read,
-)
+from bampipe.schema import Declaration, NamedDeclaration, Positive, Several, Text, checked_by
 
 FILE_NAME = "session.toml"
 
@@ -111,14 +100,12 @@ def _moment(value: Any) -> Any:
             datetime.datetime.fromisoformat(value)
         except ValueError:
             said = f'found "{value}", expected a date and time like 2026-10-03T10:12:00Z'
-            raise fault(said) from None
+            raise schema.fault(said) from None
     return value
 
 
 LogPath = Annotated[
-    Text,
-    AfterValidator(checked_by(_inside)),
-    Field(description="Path relative to the session folder"),
+    Text, AfterValidator(checked_by(_inside)), Field(description="Path in the session folder")
 ]
 
 
@@ -158,11 +145,11 @@ class TrialEntry(NamedDeclaration):
     """The locked axis, of a locked trial"""
     viscous: Positive | None = Field(default=None, alias="viscous_n_s_per_m")
     """Commanded Cartesian damping, N.s/m, of a viscous trial"""
-    start_s: NotNegative = 0.0
+    start_s: schema.NotNegative = 0.0
     """Where in the record the trial starts, s after its first sample"""
     end_s: Positive = math.inf
     """Where it ends, s after the first sample of the record; this moment excluded"""
-    negated: Distinct[ChannelName] = ()
+    negated: schema.Distinct[ChannelName] = ()
     """Axes, components of the force and channels that were logged with the other sign in this
     trial"""
     hold_out: bool = Field(default=False, description="Never fitted, only for judging models")
@@ -192,8 +179,7 @@ class TrialEntry(NamedDeclaration):
                 yield InputError(f"{times} parts are called '{name}'", where="parts")
         if not self.start_s < self.end_s:
             yield InputError(
-                f"found {self.end_s:g}, expected more than start_s = {self.start_s:g}",
-                where="end_s",
+                f"found {self.end_s:g}, expected more than start_s, {self.start_s:g}", where="end_s"
             )
 
 
@@ -245,13 +231,13 @@ class Session(Declaration):
     """The time column, where it is not time_us in microseconds"""
     dialect: Dialect = Field(default=Dialect(), alias="csv")
     """Layout of text files, where it cannot be found in them"""
-    encoders: Annotated[tuple[Encoder, ...], ByName(ChannelName, least=1)] = Field(
+    encoders: Annotated[tuple[Encoder, ...], schema.ByName(ChannelName, least=1)] = Field(
         description="One entry an axis"
     )
     force: Force | None = Field(default=None, description="Force sensor, or force of the motors")
     brake_table: BrakeTable | None = Field(default=None, alias="brakes")
     """Commanded braking"""
-    channels: Annotated[tuple[Channel, ...], ByName(ChannelName)] = Field(
+    channels: Annotated[tuple[Channel, ...], schema.ByName(ChannelName)] = Field(
         default=(), description="Any other recorded input"
     )
     trials: Annotated[Several[TrialEntry], Field(min_length=1), AfterValidator(_with_ids)] = Field(
@@ -395,6 +381,6 @@ def session_from(table: Mapping[str, Any], root: Path, where: str = FILE_NAME) -
     Raises:
         InputError: any mistake, named by field.
     """
-    session = read(Session, table, where)
+    session = schema.read(Session, table, where)
     session._root = Path(root)
     return session

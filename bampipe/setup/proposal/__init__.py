@@ -22,15 +22,8 @@ from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
 from bampipe.setup.drawn_bodies import STATED
 from bampipe.setup.mounting import Mounting
-from bampipe.setup.proposal.device import (
-    DEVICE,
-    UNKNOWN_CONSTANT,
-    ChosenDevice,
-    find_device,
-    new_device,
-    with_gravity,
-    with_motors,
-)
+from bampipe.setup.proposal import device as devices
+from bampipe.setup.proposal.device import DEVICE, UNKNOWN_CONSTANT, ChosenDevice, with_motors
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
@@ -92,11 +85,11 @@ def propose(
         _refuse_goals(folder, found)
     notes = Notes(check=list(found.remarks))
     found, registers = signed_readings(fresh_readings(found, notes), notes)
-    chosen = find_device(folder, found, device)
+    chosen = devices.find_device(folder, found, device)
     clock = clock_of(found, notes)
     match = Matcher(found, clock.t, set(clock.columns), registers, notes)
     if chosen is None:
-        chosen = new_device(folder, match)
+        chosen = devices.new_device(folder, match)
     elif (robot := chosen.device.robot) is not None:
         columns = find_robot_columns(folder, chosen.device, robot, found, clock.t, notes)
         match.robot, match.given = columns, columns.columns
@@ -213,7 +206,7 @@ def _hang(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) 
         f"{said} in the frame of the base, by weight and inertia as drawn: is the robot mounted so?"
         + put
     )
-    return with_gravity(folder, chosen, said) if chosen.text else chosen
+    return devices.with_gravity(folder, chosen, said) if chosen.text else chosen
 
 
 def _check_robot(

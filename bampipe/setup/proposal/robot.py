@@ -14,16 +14,8 @@ from bampipe.data.chain import frame_of_tip, read_tree
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
-from bampipe.setup.drawn_bodies import (
-    STATED,
-    Comparison,
-    Drive,
-    JointMotion,
-    describe_heavy,
-    find_heavy,
-    fits,
-    mean_left,
-)
+from bampipe.setup import drawn_bodies
+from bampipe.setup.drawn_bodies import Comparison, Drive, find_heavy, mean_left
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.proposal.joints import Group, pair_joints
 from bampipe.setup.proposal.notes import Notes
@@ -97,7 +89,7 @@ class Logged:
         if not np.isfinite(q).all() or window >= len(q):
             return None
         smooth = (savgol_filter(q, window, 2, deriv=k, delta=step, axis=0) for k in range(3))
-        motion, unit = JointMotion(*smooth), self.device.force_unit
+        motion, unit = drawn_bodies.JointMotion(*smooth), self.device.force_unit
         forces = [scale_to(unit, c) * np.nan_to_num(c.values) for c in drives.columns]
         drive = np.column_stack(forces)
         turning = tuple(c.unit == "rad" for c in self.device.coordinates)
@@ -169,7 +161,7 @@ class Logged:
             geared = many.reread(np.diag(1.0 / ratio))
             found = Gears(ratio, mounting, geared.hold(mounting), geared)
             # A gear that speeds up would take the joint further beyond its range than the log goes.
-            return found if fits(found.drives) and ratio.min() >= 1.0 else None
+            return found if drawn_bodies.fits(found.drives) and ratio.min() >= 1.0 else None
 
         starts = [np.where(moved, factor * least, 1.0) for factor in _MARGINS]
         ratio = min((fitted(start, few.nominal) for start in starts), key=lambda one: one[0])[1]
@@ -252,7 +244,7 @@ def find_robot_columns(
             "positions state no unit and go beyond the joints' ranges: degrees are taken; if they"
             f" are radians of motors, {PUT_IN}"
         )
-    left, sound = mean_left(best.drives), fits(best.drives)
+    left, sound = mean_left(best.drives), drawn_bodies.fits(best.drives)
     beyond = _beyond_range(logged, positions, of_joint=sound)
     guessed = positions is not stated and left > _DOUBTED
     on_motors = bool(beyond) if known else guessed and not robot.motors
@@ -287,7 +279,7 @@ def find_robot_columns(
             best, (positions, drives) = other, ordered
     if device.force_unit != "A" and (heavy := find_heavy(best.compared, best.mounting)):
         in_tip = _placed_in_tip(folder, robot)
-        notes.check.append(describe_heavy(best.compared, best.mounting, heavy, in_tip))
+        notes.check.append(drawn_bodies.describe_heavy(best.compared, best.mounting, heavy, in_tip))
     columns = pair(positions, drives)
     by_input = dict(zip(device.forces, best.drives, strict=True))
     notes.check += _sentences(device, columns, by_input)
@@ -399,9 +391,9 @@ def _sentences(
             said.append(f"its sign is turned; or that of {c.name} is the wrong one")
         if device.force_unit == "A":
             agreed.append(f"{c.name} {1.0 / size:.3g} {c.torque_unit}/A")
-        elif size >= STATED[1]:
+        elif size >= drawn_bodies.STATED[1]:
             said.append("another unit, or bodies that are not drawn")
-        elif size <= STATED[0]:
+        elif size <= drawn_bodies.STATED[0]:
             said.append(
                 f"another unit, or the torque of a motor with a reduction of about {1.0 / size:.3g}"
             )

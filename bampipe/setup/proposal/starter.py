@@ -262,12 +262,10 @@ def _least_inertia(linear: bool, coil: bool, found: Driven) -> float:
     return _rounded(max(least, heavy) if coil and linear else least)
 
 
-def _parameter(
-    name: str, unit: str, guessed: tuple[str, ...], meaning: str, known: str = ""
-) -> str:
-    """A table of a parameter: lines that are ``guessed``, and what is ``known`` of its meaning."""
+def _parameter(name: str, unit: str, guessed: tuple[str, ...], meaning: str, more: str = "") -> str:
+    """A table of a parameter: lines that are ``guessed``, and what ``more`` is known."""
     marked = "".join(f"{line}  # guess\n" for line in guessed)
-    return f'\n[parameters.{name}]\nunit = "{unit}"\n{marked}description = "{meaning}"\n{known}'
+    return f'\n[parameters.{name}]\nunit = "{unit}"\n{marked}description = "{meaning}"\n{more}'
 
 
 def _prior(size: float, wide: float) -> tuple[str, str]:
