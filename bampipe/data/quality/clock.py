@@ -1,7 +1,6 @@
 """Time stamps: seconds from whatever was logged, without steps back, gaps or a rolled counter."""
 
 from collections.abc import Sequence
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +12,11 @@ from bampipe.lists import count_noun
 
 COARSEST_STAMP = 0.05
 """Share of a step to which time stamps may be rounded: their scatter is a third of it."""
-_BITS, _SCALES = (32, 24, 16), (1.0, 1e-3, 1e-6, 1e-9)
-"""Widths of counters, and what the stamps of one may have been multiplied by."""
+_PERIODS = (
+    *((f"{n} bits", unit * 2.0**n) for n in (32, 24, 16) for unit in (1.0, 1e-3, 1e-6, 1e-9)),
+    *(("midnight", unit * 86_400.0) for unit in (1.0, 1e3, 1e6, 1e9)),
+)
+"""Where clocks roll over, and after how much, by what stamps may have been multiplied by."""
 _NEAR_ROLL = 5.0
 """Steps within which a stamp that rolled over goes on where the one before stopped."""
 _OF_ONE_LATTICE = 1e-3
@@ -41,26 +43,28 @@ _SEAM = 3.0
 """Times the largest step of a position, over which it goes on where a clock was set back."""
 
 
-def unroll(t: Array) -> tuple[Array, int, NDArray[np.intp]]:
-    """Undo the roll-over of a counter of 16, 24 or 32 bits, in whatever unit its stamps (T,) are.
+def unroll(t: Array) -> tuple[Array, str, NDArray[np.intp]]:
+    """Undo the roll-over of a counter of 16, 24 or 32 bits, or of a time of day.
+
+    Args:
+        t: (T,) stamps, in whatever unit.
 
     Returns:
-        Stamps (T,) that go on, the bits of the counter, 0 where none rolls over, and the rows of
-        the first stamps after each.
+        Stamps (T,) that go on, where they roll over, "" if they do not, and the rows of the first
+        stamps after each.
     """
     steps = np.diff(t)
     drops = np.flatnonzero(steps < 0.0)
     ahead = steps[steps > 0.0]
     if len(drops) and len(ahead):
         usual = float(np.median(ahead))
-        for bits, scale in product(_BITS, _SCALES):
-            period = scale * 2.0**bits
+        for where, period in _PERIODS:
             goes_on = steps[drops] + period
             near = np.all((goes_on > 0.0) & (goes_on < _NEAR_ROLL * usual))
             if near and np.ptp(t) <= period and usual < 0.1 * period:
                 turned = np.cumsum(np.append(0.0, steps < 0.0))
-                return t + period * turned, bits, drops + 1
-    return t, 0, np.empty(0, dtype=np.intp)
+                return t + period * turned, where, drops + 1
+    return t, "", np.empty(0, dtype=np.intp)
 
 
 def spread_stamps(t: Array) -> tuple[Array, float]:
@@ -208,10 +212,10 @@ def time_to_seconds(table: TrialTable) -> None:
 
 def _unwrap_clock(table: TrialTable) -> None:
     """Undo the roll-over of a clock that counts, and spread stamps of too few digits."""
-    table.t, bits, rows = unroll(table.t)
-    if bits:
+    table.t, where, rows = unroll(table.t)
+    if where:
         table.repairs.append(
-            f"clock rolls over at {bits} bits {in_times(len(rows))}, first at row"
+            f"clock rolls over at {where} {in_times(len(rows))}, first at row"
             f" {table.rows[rows[0]]}: unrolled"
         )
     table.t, rounding = spread_stamps(table.t)
@@ -233,9 +237,7 @@ def put_in_order(table: TrialTable) -> None:
     lone[1:-1] = (t[1:-1] > t[2:]) & (t[:-2] < t[2:])
     if 0 < lone.sum() <= _few(table, len(table)):
         table.keep(~lone)
-        table.repairs.append(
-            f"{count_noun(int(lone.sum()), 'row')} with a time stamp out of order dropped"
-        )
+        table.repairs.append(f"{count_noun(int(lone.sum()), 'row')} with a wild stamp dropped")
         t = table.t
     mixed = np.maximum.accumulate(t)[:-1] > np.minimum.accumulate(t[::-1])[::-1][1:]
     sources = [encoder.column for encoder in table.session.encoders]
@@ -244,13 +246,11 @@ def put_in_order(table: TrialTable) -> None:
     for start, stop in zip(*find_runs(mixed), strict=True):
         rows = slice(start, stop + 1)
         place = start + np.argsort(t[rows], kind="stable")
-        as_written, as_stamped = (
-            np.abs(np.diff(positions[:, which])).sum() for which in (np.r_[rows], place)
-        )
+        travels = [np.abs(np.diff(positions[:, x])).sum() for x in (np.r_[rows], place)]
         falls = start + np.flatnonzero(np.diff(t[rows]) < 0.0)
         # Two recordings one after the other fall once, and their stamps are the same.
         late_rows = len(falls) > 1 and np.mean(np.diff(t[place]) == 0.0) < _UNLIKELY_TWICE
-        if late_rows and as_stamped < _SMOOTHER * as_written:
+        if late_rows and travels[1] < _SMOOTHER * travels[0]:
             order[rows] = place
             late += int(np.sum(place != np.arange(start, stop + 1)))
         elif len(falls) == 1:
@@ -266,9 +266,7 @@ def put_in_order(table: TrialTable) -> None:
                 )
     if late:
         table.keep(order)
-        table.repairs.append(
-            f"{count_noun(late, 'row')} written out of order sorted by their time stamps"
-        )
+        table.repairs.append(f"{count_noun(late, 'row')} written out of order sorted by time")
 
 
 def drop_backward_stamps(table: TrialTable) -> None:
