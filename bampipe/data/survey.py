@@ -95,18 +95,21 @@ _BY_UNIT = {
     "m/s": "velocity", "kg": "force", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
 }  # fmt: skip
 _SHORT_UNITS = frozenset(["mm", "Nm", "kN", "gf", "mA", "mV"])
-_PLAIN_WORDS = frozenset(
-    ["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano", "meter"]
-)
+_LONG_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano", "meter"])
 """Units of two letters at the end of a name that are no words, and longer ones that are."""
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _PRESENT = frozenset(["current", "curr", "cur"])
 _LONGEST_WORD = 2
 """Letters at the end of a name that are a word rather than a unit, such as the in of pos_in."""
+_FACTOR = re.compile(
+    r"(?i)(?:\s?[*×]\s?|[_ .(]+(?:x ?|(?:div|by|times)[_ ]?|(?=1?e\d\Z|10+0\Z)))"
+    r"(?:1?e\d|10+|\d{3,})(?![a-z\d.])"
+)
+"""In a name, what its unit is multiplied by, or its numbers are."""
 _JOINED = {
     "rows": "row by row",
     "time": "by their times",
-    "start": "by their times, as if started together",
+    "start": "by their times, as if begun together",
 }
 _UNIT_WORDS = {
     "time": ("us", "ms", "ns", "s", "min"),
@@ -338,9 +341,7 @@ class _Logs:
             pool = {n: self.found[n] for n in names} if axes and whole else self.found
             trials, reasons = join_parts(self.folder, pool, _role, self.dialect)
             shared = [set(self._labels(trial)) for trial in trials]
-            best = max(
-                shared, key=lambda labels: (shared.count(labels), len(labels)), default=set()
-            )
+            best = max(shared, key=lambda own: (shared.count(own), len(own)), default=set())
             trials = [trial for trial, has in zip(trials, shared, strict=True) if best <= has]
             if trials and (axes or self._completeness(self._labels(trials[0])) == _WHOLE):
                 used = {p for t in trials for p in (t.file, *(x.file for x in t.parts))}
@@ -467,6 +468,9 @@ class _Logs:
                 # Of files without a header, named for what the rest of their columns is.
                 role = "time" if is_time(raw.columns[column][sound]) else role
             unit = _unit(column, said, role)
+            factor = _FACTOR.search(column)
+            if unit and factor and factor[0] not in unit:
+                unit = said = f"{unit}, {factor[0].strip('_. (')}"
             found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
         keys = [c.values for c in found if c.is_integer and c.role not in ("time", "position")]
         nameless = [c for c in found if not c.role and len(np.unique(c.values)) > MOST_IN_TURN]
@@ -635,9 +639,7 @@ def _role(name: str, stated: str) -> str:
         roles = [r for r in roles if longer & set(_WORDS[r].split())] or roles  # T.Angle
     elif len(roles) > 1:
         # x_F: letters that stand for several quantities
-        return next(
-            (_role_by_unit(x) for x in re.split(r"[_\W]+", name)[1:] if x in "AV" and x), ""
-        )
+        return next((_role_by_unit(x) for x in re.split(r"\W|_", name)[1:] if x in ("A", "V")), "")
     if not roles and name.startswith(lerobot.STATE):
         return "voltage" if "load" in name else "position"
     return next(iter(roles), "") or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
@@ -650,7 +652,7 @@ def _role_by_unit(text: str) -> str:
 
 def _role_by_suffix(suffix: str) -> str:
     """The role by a unit at the end of a name that says nothing else."""
-    long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _PLAIN_WORDS
+    long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _LONG_WORDS
     role = _role_by_unit(suffix) if long or suffix in _SHORT_UNITS else ""
     return role if role != "time" else ""
 
@@ -659,7 +661,7 @@ def _unit(name: str, stated: str, role: str) -> str:
     """Unit by the file, or by a last word of the name such as ``_us``, before an index if any."""
     if stated:
         return "rev/s" if role == "velocity" and unit(stated) == unit("Hz") else stated
-    bare = re.sub(r"(\[\d+\]|_\d+)$", "", name.translate(_PLAIN))
+    bare = re.sub(r"(\[\d+\]|_\d+)$", "", _FACTOR.sub("", name.translate(_PLAIN)))
     if role == "velocity" and (rate := re.search(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$", bare)):
         return f"{rate[1]}/s"
     parts = re.findall(r"(?:\d+\.(?=\d))?[^\W_]+|[°%]", bare)

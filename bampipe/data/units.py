@@ -3,8 +3,10 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ _LOGGED = frozenset(["", *_ORDER, "N.m", "rad/s", "rad/s2", "m/s", "m/s2"])
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "da": 10.0, "k": 1e3, "M": 1e6}
 _PREFIXED = frozenset(["s", "m", "rad", "deg", "N", "A", "V", "W", "Hz", "Pa", "T", "g", "bar"])
 _WHOLE = {
-    "1/min": "rev/min", "-": "", "1": "",
+    "1/min": "rev/min", "min1": "rev/min", "-": "", "1": "",
     "none": "", "ozin": "ozf.in", "kgcm": "kgf.cm", "inlb": "lbf.in", "lbin": "lbf.in",
     "ftlb": "lbf.ft", "lbft": "lbf.ft", "kgfcm": "kgf.cm",
 }  # fmt: skip
@@ -55,9 +57,11 @@ _SPELLINGS = {
     "tr": "rev", "grado": "deg", "grados": "deg", "grader": "deg", "derece": "deg", "degré": "deg",
 }  # fmt: skip
 """Of single factors; those in the plural are found without their s."""
-_PLAIN = str.maketrans("µμ²³⁻¹", "uu23-1")
+_PLAIN = str.maketrans("µμ×⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "uux-0123456789")
 _CELSIUS = frozenset(["degc", "°c", "c", "celsius"])
 _NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
+SCALES = ("scale", "scaling", "factor", "lsb", "gain")
+"""What a file calls the number that readings are to be multiplied by, beside them."""
 _BESIDE = re.compile(r"(?i)(?:\A|(?<=[./]))units?[./]|(?:\A|[ _./])units?\Z")
 """Affix that marks a metadata field as the unit of a quantity: the rest names the quantity."""
 _INDEX = re.compile(r"\d+|0x[0-9A-Fa-f]+|\d[0-9A-Fa-f]{3}h")
@@ -66,7 +70,7 @@ _TOKEN = re.compile(
     r"(?P<number>(?<![^\W_])\d+(?:\.\d+)?(?:[eE]-?\d+)?|\.\d+)"
     r"|(?P<over>\s*(?:/|\bper\b)\s*)"
     r"|(?P<word>[^\W\d_]+|[%‰]|[°º][A-Za-z]?)(?:(?:\^|\*\*)?(?P<power>-[1-4]|[2-4])(?![\d.]))?"
-    r"|\s*[*·⋅・.\s-]\s*"
+    r"|\s*[*·⋅∙・.\s-]\s*"
 )  # fmt: skip
 
 
@@ -110,6 +114,21 @@ def units_beside(texts: Mapping[str, str]) -> dict[str, str]:
     return {of: texts[name] for of, name in found if of != name}
 
 
+def in_steps(values: np.ndarray, sizes: Collection[float], text: str, sure: bool = True) -> str:
+    """Unit of readings (T,) that a file says to multiply by one of ``sizes``; ``text``: that then.
+
+    None that is known where they may be multiplied already, as others than whole numbers may, or
+    multiples of a size above one; or where it is not ``sure`` that they are meant.
+    """
+    if {*sizes} == {1.0}:
+        return text
+    sure &= len(sizes) == 1 and bool(np.all(values == np.rint(values)))
+    sure &= not any(size > 1.0 and np.all(values % size == 0.0) for size in sizes)
+    size = " or ".join(map(repr, sizes))
+    step = f"{size} {text}" if text else f"steps of {size} of no stated unit"
+    return step if sure else f"{step}, if not applied"
+
+
 def unit(text: str) -> RecordedUnit | None:
     """What ``text`` stands for, None where that is not known.
 
@@ -118,8 +137,8 @@ def unit(text: str) -> RecordedUnit | None:
     prefix, ``13.5mA`` is a reading in steps of 13.5 mA. ``nm`` is a nanometre, not a torque; a
     mass times a length is a torque.
     """
-    plain = bare(text).translate(_PLAIN)
-    plain = re.sub(r"(?:x ?)?\b10(?:\^|\*\*)(-?\d+)", r"1e\1", plain)
+    plain = re.sub("10(?=[⁻⁰¹²³⁴⁵⁶⁷⁸⁹])", "10^", bare(text)).translate(_PLAIN)
+    plain = re.sub(r"(?:\bx ?|\b)10(?:\^|\*\*)(-?\d+)", r"1e\1", plain)
     plain = _WHOLE.get(plain.lower().replace("-", "").replace(".", "") or plain, plain)
     plain = re.sub(
         r"(?i)(?<![a-z])(rpm|r/min|rps|dps)(?![a-z])", lambda rate: _RATES[rate[0].lower()], plain
@@ -136,6 +155,9 @@ def unit(text: str) -> RecordedUnit | None:
             return None
         at = token.end()
         if token["number"]:
+            # In N.m x 1000, thousands or thousandths; in 10-2 N, a power or a product.
+            if sign > 0 and (float(token["number"]) > 1.0 if factors else scale != 1.0):
+                return None
             scale *= float(token["number"]) ** sign
         if token["word"]:
             found = _factor(token["word"])

@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
@@ -295,11 +296,9 @@ def write_ros(path: Path, kind: str) -> Path:
 def test_ros(tmp_path, kind):
     path = write_ros(tmp_path, kind)
     columns = (
-        "/joint_states:header.stamp",
-        "/joint_states:position[elbow]",
-        "/joint_states:effort[0]",
+        "/joint_states:header.stamp", "/joint_states:position[elbow]", "/joint_states:effort[0]",
         "/ft/wrench:wrench.force.x",
-    )
+    )  # fmt: skip
     trial = read_trial(path, columns)
     for column, values in zip(columns, (T, Q, F, T), strict=True):
         np.testing.assert_allclose(trial.columns[column], values, atol=1e-9)
@@ -443,12 +442,10 @@ def test_an_mcap_file_whose_summary_lies(tmp_path, lie, said):
 @pytest.mark.parametrize(
     ("ending", "module", "extra"),
     [
-        (".tdms", "nptdms", "tdms"),
-        (".bag", "rosbags.highlevel", "ros"),
-        (".mcap", "mcap.reader", "ros"),
-        (".xlsx", "openpyxl", "xlsx"),
+        (".tdms", "nptdms", "tdms"), (".bag", "rosbags.highlevel", "ros"),
+        (".mcap", "mcap.reader", "ros"), (".xlsx", "openpyxl", "xlsx"),
     ],
-)
+)  # fmt: skip
 def test_a_missing_extra_names_the_command(tmp_path, monkeypatch, ending, module, extra):
     monkeypatch.setitem(sys.modules, module, None)
     path = tmp_path / f"a{ending}"
@@ -471,6 +468,7 @@ def test_units_in_names_and_beside_the_columns_are_heard_in_every_format(tmp_pat
     scipy.io.savemat(tmp_path / "e.mat", {"log": {"q": Q, "units": units}})
     feather.write_feather(pq.read_table(tmp_path / "a.parquet"), tmp_path / "f.feather")
     shutil.copy(tmp_path / "d.h5", tmp_path / "g.nc")
+    np.savez(tmp_path / "h.npz", q=Q, q_unit="deg")
     units |= {"t [ms]": "ms", "f (mN.m)": "mN.m"}
     for path in tmp_path.iterdir():
         found = {x.removeprefix("log."): unit for x, unit in columns_of(path).items()}
@@ -479,3 +477,37 @@ def test_units_in_names_and_beside_the_columns_are_heard_in_every_format(tmp_pat
         trial = read_trial(tmp_path / name, ("t [ms]", "q"))
         assert trial.units == {"t [ms]": "ms", "q": "deg"}
         np.testing.assert_array_equal(trial.columns["q"], Q)
+
+
+def test_whole_numbers_are_in_steps_of_the_scale_beside_them(tmp_path):
+    """And what may be multiplied already, or whose unit is not known, has no unit that is."""
+    counts = np.arange(len(T))
+    said = {"q": "0.001 N", "f": "steps of 0.5 of no stated unit", "u": "2.0 N, if not applied"}
+    sizes = {"q": 1e-3, "f": 0.5, "u": 2.0}
+    held, units = {"q": counts, "f": counts, "u": 0.3 * F}, {"q": "N", "u": "N"}
+    beside = {f"{name}_scale": size for name, size in sizes.items()}
+    beside |= {f"{name}_unit": unit for name, unit in units.items()}
+    np.savez(tmp_path / "a.npz", **held, **beside)
+    scipy.io.savemat(tmp_path / "b.mat", held | beside)
+    plain = {name: values.tolist() for name, values in held.items()}
+    (tmp_path / "c.json").write_text(json.dumps(plain | beside))
+    signals = [{"name": n, "data": plain[n], "lsb": sizes[n]} for n in held]
+    signals = [{**one, "unit": units.get(one["name"])} for one in signals]
+    (tmp_path / "d.json").write_text(json.dumps({"log": signals}))
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        for name, values in held.items():
+            file[name] = values
+            file[name].attrs.update({"scale": sizes[name], "unit": units.get(name, "")})
+    stated = {n: {"scale": str(x), "unit": units.get(n, "")} for n, x in sizes.items()}
+    kinds = [pa.field(n, pa.array(v).type, metadata=stated[n]) for n, v in held.items()]
+    pq.write_table(pa.table([*held.values()], schema=pa.schema(kinds)), tmp_path / "f.parquet")
+    for path in sorted(tmp_path.iterdir()):
+        found = {x.removeprefix("log."): u for x, u in columns_of(path).items()}
+        assert said.items() <= found.items(), path
+    np.savez(tmp_path / "g.npz", t=T, q=counts, u=0.3 * F, scale=0.5)
+    assert columns_of(tmp_path / "g.npz")["q"].endswith("of no stated unit, if not applied")
+    scipy.io.savemat(tmp_path / "h.mat", {"q": counts, "q_unit": "deg", "q_offset": 7})
+    assert columns_of(tmp_path / "h.mat")["q"] == "deg, offset [7]"
+    np.savez(tmp_path / "i.npz", ep1_t=T, ep1_q=Q, ep2_t=T[9:], ep2_q=Q[9:])
+    joined = read_trial(tmp_path / "i.npz", ("ep[:].t", "ep[:].q"))
+    np.testing.assert_array_equal(joined.columns["ep[:].q"], np.concatenate([Q, Q[9:]]))

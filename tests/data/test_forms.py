@@ -40,9 +40,7 @@ PROPERTIES = (
 FORMS = {
     "pairs": (lines("[info] t={t:.3f} q={q:.4f} u={u:.4f}", "Booting...\n"), ("t", "q", "u")),
     "pairs of Python": (lines("{{'t': {t:.3f}, 'q': {q:.4f}, 'u': {u:.4f}}}"), ("t", "q", "u")),
-    "units in cells": (
-        lines("{t:.3f} s;{q:.4f}°;{u:.4f} Nm", "t;q;u\n"), ("t [s]", "q [°]", "u [Nm]")
-    ),
+    "unit cells": (lines("{t:.3f} s;{q:.4f}°;{u:.4f} Nm", "t;q;u\n"), ("t [s]", "q [°]", "u [Nm]")),
     "units in quotes": (
         lines('"{t:.3f} s","{q:.4f} deg","{u:.4f} Nm"', "t,q,u\n"), ("t [s]", "q [deg]", "u [Nm]")
     ),
@@ -96,6 +94,9 @@ FORMS = {
         "t,q,u,note\n" + lines("{t:.3f},{q:.4f},{u:.4f},").replace("1.0000,", ",start", 1),
         ("t", "q", "u"),
     ),
+    "names of two lines in quotes": (
+        lines("{t:.3f},{q:.4f},{u:.4f}", '"t\r\n[s]",q,"u\n\n(Nm)"\n'), ("t [s]", "q", "u (Nm)")
+    ),
     "a summary at the end": (
         lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n") + "\n# 60 rows\nLargest,0.99,\nOverruns: 0\n",
         ("t", "q", "u"),
@@ -128,6 +129,14 @@ def test_units_of_properties_are_heard(tmp_path: Path):
         ),
         (FORMS["properties with colons"][0], {"t": "s", "q": "rad", "u": "N*m"}),
         (rate, {"t": "s", "q": "°", "u": "Nm"}),
+        (
+            lines("{t:.3f};{t:.3f};{q:.4f}", "path;Root/t;Root/q\nunit;s;rad\ntrace_values;;\n"),
+            {"Time": "", "Root/t": "s", "Root/q": "rad"},
+        ),
+        (
+            lines("{n};{n};{q:.4f}", "Name;t;q\nUnit;s;Nm\nScale;0.01;0.1\n"),
+            {"Name": "", "t": "0.01 s", "q": "0.1 Nm, if not applied"},
+        ),
         (below, {"mSec": "", "TORQUE": "FT-LBS", "A (B)": "DEG"}),
         (lines("{t:.3f},{q:.4f}", "t [s],q (6064h)\n"), {"t [s]": "s", "q (6064h)": ""}),
     ):
@@ -285,6 +294,8 @@ def test_counters_wrap_at_any_width_and_go_on():
         ("t [s],q [deg],torque [%]", "calibration_n_per_v"),
         ("t [s],q [deg],torque_percent", 'calibration_n_per_v, N.m for one of "torque_percent"'),
         ("t [s],q [deg],load cell [kg]", "lever_m"),
+        ("t [s],q_deg,torque_Nm_x1000", "stated as 'Nm, x1000'"),
+        ("t [s],q_deg_e3,torque_Nm", "stated as 'deg, e3'"),
         ("t [s],belt [m/s],moment [Nm]", "[Nm] is in Nm and follows the motion, but is none"),
     ],
 )
@@ -320,6 +331,8 @@ def test_data_of_other_kinds_are_named_with_what_to_do(tmp_path: Path):
     for text, said in (
         ("(1.5) can0 141#A1250064\n" * 9, "frames of a CAN bus.*; decode them"),
         ("  can0  141   [4]  A1 25 00 64\n" * 9, "frames of a CAN bus.*; decode them"),
+        ("0.1,181,4,E3,13,00,00\n" * 9, "frames of a CAN bus.*; decode them"),
+        ("t;q;u\n" + "0.1;0.2-;(1.5)\n" * 9, "'0.2-' may be a negative number; export with the"),
         ("t,variable,value\n" + "0.1,q,0.2\n" * 9, "one signal below the other; make it"),
         ("version https://git-lfs.github.com/spec/v1\nsize 9\n", "fetch the file: git lfs pull"),
         ("# name: t\n# rows: 9\n" + "0.5\n" * 9, "as Octave writes them; save them with"),
@@ -392,9 +405,7 @@ KNOWN = {
         + lines("{t:.3f},{q:.4f},{u:.4f},"),
         "Elbow [degrees]",
     ),
-    "Qualisys": (
-        "FREQUENCY\t100\nCHANNEL_NAMES\tElbow\tTorque\n" + lines("{q:.4f}\t{u:.4f}"), "Elbow",
-    ),
+    "Qualisys": ("FREQUENCY\t100\nCHANNEL_NAMES\tArm\tTorque\n" + lines("{q:.4f}\t{u:.4f}"), "Arm"),
     "hexadecimal": (lines("{t:.3f},0x{n:04X},{u:.4f}", "t,n,u\n"), "n"),
 }  # fmt: skip
 

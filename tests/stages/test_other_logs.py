@@ -111,14 +111,12 @@ def test_degrees_milliamperes_and_decimal_commas(tmp_path):
 @pytest.mark.parametrize(
     ("stamps", "unit"),
     [
-        (T, "s"),
-        (1.79e9 + T, "s"),
-        (np.rint(T * 1e9), "ns"),
+        (T, "s"), (1.79e9 + T, "s"), (np.rint(T * 1e9), "ns"),
         (1_790_000_000_000_000 + np.rint(T * 1e6), "us"),
         ([f"2026-10-03T10:12:{t:09.6f}" for t in T], "datetime"),
         ([f"03.10.2026 10:12:{t:09.6f}" for t in T], 'datetime"\nformat = "%d.%m.%Y %H:%M:%S.%f'),
     ],
-)
+)  # fmt: skip
 def test_clocks(tmp_path, stamps, unit):
     time, text = f'column = "t"\nunit = "{unit}"', log({"t": stamps, "q": Q, "i": I})
     samples, trial, _ = ingested(tmp_path, text, time=time, **PLAIN)
@@ -233,6 +231,7 @@ def test_units_that_contradict_the_file_are_refused(tmp_path, change, said):
         ("N・m", "N.m", 1.0), ("ncm", "N.m", 0.01), ("mnm", "N.m", 1e-3),
         ("seconds since 2026-03-01 10:00:00", "s", 1.0), ("microns", "m", 1e-6),
         ("kp", "N", 9.80665), ("kgfcm", "N.m", 0.0980665), ("Grad", "rad", np.pi / 180),
+        ("10⁻² N·m", "N.m", 0.01), ("×10⁻³ rad", "rad", 1e-3), ("min⁻¹", "rad/s", np.pi / 30),
     ],
 )  # fmt: skip
 def test_units_of_logs(text, si, scale):
@@ -244,7 +243,7 @@ def test_units_of_logs(text, si, scale):
     "text",
     [
         "counts", "ticks", "furlong", "N.m.s/rad", "q", "m m m", "2", "1/s", "0 mA", "3e",
-        "20 degC", "m1",
+        "20 degC", "m1", "Nm*1000", "10-2 Nm",
     ],
 )  # fmt: skip
 def test_units_that_are_not_known(text):

@@ -19,17 +19,22 @@ import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
-from bampipe.data.units import units_beside
+from bampipe.data.units import SCALES, in_steps, units_beside
 from bampipe.errors import InputError, located
 
 LARGEST_WIDTH = 64
 _RUN = re.compile(
     r"(?i)(.+?(?=\[)|(?:.*[./_])?(?:trial|run|rep|test|take|rec|recording|exp|experiment|measurement"
-    r"|messung|versuch|essai|episode|demo|trajectory|traj|log)s?_?(?=\d))"
-    r"(?:\[([^\[\]:]+)\]|(\d+))[./]([^\[\]]+)"
+    r"|messung|versuch|essai|episode|ep|demo|trajectory|traj|log)s?_?(?=\d))"
+    r"(?:\[([^\[\]:]+)\]|(\d+))[./_]([^\[\]]+)"
 )
 """Name of an array of one of several recordings in a file."""
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
+_CLOCK = re.compile(r"(?i)(?:.*[._/])?(?:t|\w*time|\w*stamp)\Z")
+_SCALE = re.compile(
+    rf"(?i)(?:\A|[ _./])(?:{'|'.join(SCALES[:-1])}|scale_?factor|(offset))\Z|[./]gain\Z"
+)
+"""End of the name of what others are multiplied by, or of what comes on top of them."""
 _NUMBERS, _STAMPED, LINK, STATED = "iufb", "MOSU", "link", "stated"
 """Kinds of arrays of numbers, of moments or text, of what is elsewhere, of no more than a unit."""
 
@@ -73,6 +78,7 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
     Raises:
         InputError: an array is missing, not a vector of numbers, or not as long as the others.
     """
+    arrays = _in_steps(arrays)
     units = {name: array.unit for name, array in arrays.items() if array.kind == STATED}
     arrays = {name: array for name, array in arrays.items() if name not in units}
     joined, begun = _join_runs(arrays)
@@ -131,7 +137,7 @@ def columns_of_arrays(arrays: Arrays) -> dict[str, str]:
     And of numbers that stand alone. Beside a log a file may keep what belongs to no sample: gains
     by axis, a table of settings.
     """
-    joined = _join_runs(arrays)[0]
+    joined = _join_runs(_in_steps(arrays))[0]
     found = {name: array for name, array in joined.items() if array.kind in _NUMBERS + "M"}
     by_length: dict[int, list[str]] = {}
     for name, array in found.items():
@@ -145,6 +151,32 @@ def columns_of_arrays(arrays: Arrays) -> dict[str, str]:
         for column in labels(name, array.shape)
         if column in kept
     }
+
+
+def _in_steps(arrays: Arrays) -> Arrays:
+    """The arrays, those with a scale beside them in steps of it: ``position_scale``, ``q.lsb``.
+
+    That is their unit, and none that is known where it may have been applied already, as to numbers
+    that are no integers, or may be of another array in its group.
+    """
+    found = dict(arrays)
+    for label, number in arrays.items():
+        said = _SCALE.search(label)
+        if not said or number.kind not in _NUMBERS or math.prod(number.shape) > LARGEST_WIDTH:
+            continue
+        owner, sizes = re.escape(label[: said.start()]), sorted({*number.load().ravel().tolist()})
+        tied = [n for n in arrays if re.fullmatch(rf"(?i){owner}([./]({'|'.join(_VALUES)}))?", n)]
+        group = (n for n in arrays if re.match(f"{owner}[./]" if owner else "", n))
+        for name in tied or (name for name in group if not _CLOCK.match(name)):
+            known, values = found[name], np.empty(0)
+            values = known.load() if known.kind in _NUMBERS else values
+            whole = bool(np.all(values == np.rint(values)))
+            if values.size > len(sizes) and (tied or whole) and not said[1]:
+                step = in_steps(values, sizes, known.unit, sure=bool(tied))
+                found[name] = replace(known, unit=step)
+            elif values.size > 1 and tied and whole and said[1] and known.unit and any(sizes):
+                found[name] = replace(known, unit=f"{known.unit}, offset {sizes}")
+    return found
 
 
 def called_signals(labels: Iterable[str], texts: Mapping[str, str]) -> dict[str, tuple[str, str]]:
@@ -282,10 +314,11 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
             remedy="save arrays of numbers: np.savez(FILE, t=t, q=q, tau=tau)",
         ) from error
     found: dict[str, Stored] = {}
+    units = units_beside({x: str(a.ravel()[0]) for x, a in whole.items() if a.size == 1})
     for key, array in whole.items():
         fields = array.dtype.names
         parts = {f"{key}.{part}": array[part] for part in fields} if fields else {key: array}
-        found |= {label: stored(np.atleast_1d(part)) for label, part in parts.items()}
+        found |= {n: stored(np.atleast_1d(x), units.get(n, "")) for n, x in parts.items()}
     blocks = [(name, array.shape) for name, array in found.items() if len(array.shape) > 2]
     if wanted is None and blocks and len(blocks) == len(found):
         name, shape = blocks[0]

@@ -12,9 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import islice, zip_longest
 
+import numpy as np
+
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER, Dialect, check_columns
-from bampipe.data.units import bare, unit, units_in
+from bampipe.data.units import bare, in_steps, unit, units_in
 from bampipe.errors import InputError
 
 HEAD = 1 << 16
@@ -34,8 +36,9 @@ _NO_ANGLE = re.compile(
 )
 _NUMBERED = "column_"
 _NAME_KEYS = frozenset(
-    ["name", "names", "signal", "channel", "kanal", "signalname", "channeltitle"]
+    ["name", "names", "signal", "channel", "kanal", "signalname", "channeltitle", "path"]
 )
+_SCALES = re.compile(r"(?i)scal(e|ing)[ _]?(factor)?|factor|faktor|skalierung|lsb")
 _SEARCHED = 200
 _TRIED = 400
 _ALIKE = 0.97
@@ -71,7 +74,8 @@ class TableLayout:
 
     def is_header(self, text: str) -> bool:
         """Whether a line among the samples is the header once more."""
-        return bool(self.title) and self.cells(text) == self.cells(self.title)
+        plain = text.removeprefix("\ufeff")  # of a file that was appended
+        return bool(self.title) and self.cells(plain) == self.cells(self.title)
 
     def is_remark(self, text: str) -> bool:
         """Whether a line begins with a word, where samples begin with a number or a time."""
@@ -129,7 +133,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     # Not the joint whose name was put in brackets.
     units = {h: u for h, u in units_in(header).items() if dialect.names or u in named}
     units |= _units_of_motion([line.text for line in lines[:index]], header)
-    remarks = []
+    remarks, scales = [], dict[str, float]()
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
     above = len(_filled(lines[: max(index, 0)]))
@@ -142,8 +146,12 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
         row = cells(_REMARK.sub("", line.text, count=1) if remark else line.text, delimiter)
         if delimiter == " " and 1 < len(row) < len(header) and _are_units(row):
             row = _below(line.text, header, named)
+        key = row[0] if row else ""
         row, property_row = _of_properties(row)
         property_row &= at < first < len(body)
+        if _SCALES.fullmatch(key) and key not in row:
+            property_row = True
+            scales = {h: float(x) for h, x in zip(header, row, strict=False) if _POINT.match(x)}
         if (
             _is_unit_row(row, header, columns)
             and not dialect.names
@@ -165,12 +173,16 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     decimal = dialect.decimal or _decimal(body, header, columns, delimiter)
     if decimal == "," and not dialect.decimal:
         remarks.append("decimal commas")
+    for place, name in enumerate(header):
+        if name in scales:
+            rows = (cells(line.text, delimiter) for line in body[:_TRIED])
+            read = [row[place].replace(decimal, ".") for row in rows if len(row) == len(header)]
+            values = np.array([float(cell) for cell in read if _POINT.match(cell)])
+            units[name] = in_steps(values, [scales[name]], units.get(name, ""))
     start = lines[passed].end if passed >= 0 else _mark(head)
     number = lines[passed].number + 1 if passed >= 0 else 1
     title = lines[index].text if index >= 0 and not dialect.names else ""
-    return TableLayout(
-        delimiter, decimal, tuple(header), number, start, tuple(remarks), units, title
-    )
+    return TableLayout(delimiter, decimal, tuple(header), number, start, (*remarks,), units, title)
 
 
 def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
@@ -244,9 +256,8 @@ def _header(
         first, delimiter = _guess(lines, delimiters)[0]
         return max(_filled(lines[:first]), default=-1), delimiter, list(dialect.names)
     guesses = _guess(lines, delimiters)
-    width = (
-        len(cells(lines[guesses[0][0]].text, guesses[0][1])) if guesses[0][0] < len(lines) else 0
-    )
+    at, mark = guesses[0]
+    width = len(cells(lines[at].text, mark)) if at < len(lines) else 0
 
     def names(index: int, delimiter: str) -> list[str]:
         row = _names(lines[index].text, delimiter, lines[index + 1 :], lines[:index])
@@ -332,7 +343,9 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
 def _is_key_of_names(row: list[str]) -> bool:
     """Whether a line says of itself that it holds names: before each of them, or once."""
     key = row[0].lower() if row else ""
-    return key.rstrip("=:") in _NAME_KEYS and (row.count(row[0]) > 1 or key[-1] in "=:")
+    return key.rstrip("=:") in _NAME_KEYS and (
+        row.count(row[0]) > 1 or key[-1] in "=:" or key == "path"
+    )
 
 
 def _told_apart(header: list[str], above: list[str]) -> list[str]:
@@ -430,6 +443,8 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
     ]
     while len(fitting) > 1 and any(re.match(r"[A-Za-z ]+:\s+\S", c) for c in rows[fitting[-1]]):
         fitting.pop()  # Type: double
+    while len(fitting) > 1 and all(rows[fitting[-2]]) and _says_more(rows[fitting[-1]]):
+        fitting.pop()
     for n in reversed(_filled(lines[:first])):
         row = cells(lines[n].text, delimiter)
         if len(row) != width:
@@ -442,6 +457,12 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
     if len(fitting) > 1 and _are_units(rows[fitting[-1]]) and len(rows[fitting[-2]]) == width:
         return fitting[-2]
     return fitting[-1] if fitting else -1
+
+
+def _says_more(row: list[str]) -> bool:
+    """Whether a line below the names holds units or numbers behind a key, or the key alone."""
+    said = [cell for cell in _of_properties(row)[0] if cell]
+    return not said or (len(said) < len(row) and all(unit(x) or _POINT.match(x) for x in said))
 
 
 def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:

@@ -4,7 +4,7 @@ A column is the path of a dataset (``log/force``), a field of a compound one (``
 or a column of a matrix (``log/pose[2]``). What lies outside the file is not followed.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy as np
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import LINK, ArrayReader, Opened, Stored, pick, split_index, stored
 from bampipe.data.readers.trial import Wanted
+from bampipe.data.units import SCALES, in_steps
 from bampipe.errors import InputError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -55,13 +56,14 @@ def _arrays(file: Any, alone: bool) -> Iterator[tuple[str, Stored]]:
         kind = "U" if data.attrs.get("MATLAB_class") == b"char" else data.dtype.kind
         for at, field in enumerate(data.dtype.names or (None,)):
             kind = data.dtype[field].kind if field else kind
-            array = Stored(data.shape, kind, partial(_read, data, field), _unit(data, at))
+            load = partial(_read, data, field)
+            array = Stored(data.shape, kind, load, _unit(data, at, load))
             if not (alone and names):
                 yield label if field is None else f"{label}.{field}", array
             for place, name in enumerate(names):
-                load, said = partial(_read, data, None, place), _unit(data, place)
-                column = Stored((max(data.shape),), array.kind, load, said)
-                yield f"{label}/{name}", column
+                load = partial(_read, data, None, place)
+                said = _unit(data, place, load)
+                yield f"{label}/{name}", Stored((max(data.shape),), array.kind, load, said)
 
 
 def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
@@ -118,8 +120,13 @@ def _texts(cells: Iterable[Any]) -> list[str]:
     return [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in cells]
 
 
-def _unit(data: Any, place: int) -> str:
-    """Unit that the file states for a dataset, or in a list for the columns or fields of it."""
-    stated = (data.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in data.attrs)
-    said = _texts(np.atleast_1d(next(stated, "")))
-    return said[0] if len(said) == 1 else said[place] if place < len(said) else ""
+def _unit(data: Any, place: int, load: Callable[[], np.ndarray]) -> str:
+    """Unit that the file states for what ``load`` reads, or in a list for columns or fields."""
+    said, sizes = (
+        np.ravel(next((data.attrs[key] for key in keys if key in data.attrs), []))
+        for keys in (("unit", "units", "Unit", "Units"), SCALES)
+    )
+    texts = _texts(said)
+    text = texts[0] if len(texts) == 1 else texts[place] if place < len(texts) else ""
+    size = sizes[place if len(sizes) > 1 else 0 :][:1].tolist()
+    return in_steps(load(), size, text) if size and sizes.dtype.kind in "iuf" else text

@@ -103,12 +103,14 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     texts = {path: text for path, text in leaves(content) if isinstance(text, str)}
     units = units_beside(texts)
     beside = leaves(content) if isinstance(content, dict) else ()
-    alone = {k: _column([x], "", units) for k, x in beside if is_number(x) and "[" not in k}
+    numbers = {k: _column([x], "", units) for k, x in beside if is_number(x)}
+    alone = {k: held for k, held in numbers.items() if "[" not in k}
     if not (lists and single) and (arrays := dict(_arrays(content))):
         kinds = {label: "M" * (array.dtype.kind == "O") for label, array in arrays.items()}
-        called = called_signals(arrays, texts).items()
-        held = {name: stored(arrays[x], unit, kinds[x]) for x, (name, unit) in called}
-        yield _stating(held | alone, units), notes
+        called = called_signals({**arrays, **numbers}, texts).items()
+        held = {n: stored(arrays[x], unit, kinds[x]) for x, (n, unit) in called if x in arrays}
+        held |= {n: numbers[x] for x, (n, _) in called if x in numbers and "[" not in n}
+        yield _stating(held, units), notes
         return
     if not isinstance(content, list) and len(lists) != 1:
         raise InputError(

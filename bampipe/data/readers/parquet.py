@@ -1,6 +1,7 @@
 """Parquet and Feather files: one row a sample; columns of vectors element by element."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,8 +16,8 @@ from pyarrow import dataset
 from bampipe.data.readers import lerobot, moments
 from bampipe.data.readers.arrays import ArrayReader, Opened, Stored
 from bampipe.data.readers.nested import leaves
-from bampipe.data.readers.trial import RawTrial, Wanted
-from bampipe.data.units import units_beside
+from bampipe.data.readers.trial import NUMBER, RawTrial, Wanted
+from bampipe.data.units import SCALES, in_steps, units_beside
 from bampipe.errors import InputError
 
 _KINDS = {
@@ -50,7 +51,11 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         own = field.metadata or {}
         stated = (own.get(b"unit") or own.get(b"units") or b"").decode("utf-8", "replace")
         load = partial(_cells, read_column, field.name)
-        found[field.name] = Stored((rows,), kind, load, stated or beside.get(field.name, ""))
+        said = stated or beside.get(field.name, "")
+        sizes = (own.get(key.encode(), b"").decode("utf-8", "replace") for key in SCALES)
+        if size := [float(text) for text in sizes if re.fullmatch(NUMBER, text)]:
+            said = in_steps(load(), size, said)
+        found[field.name] = Stored((rows,), kind, load, said)
     for name, (vector, place) in lerobot.vector_columns(path, schema).items():
         found[name] = Stored((rows,), "f", partial(_cells, read_column, vector, place))
     yield found, ()

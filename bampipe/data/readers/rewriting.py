@@ -32,8 +32,12 @@ _LABVIEW = re.compile(
     r"(?:LabVIEW|[A-Z]\w*_[A-Z]\w*|Separator|X_Columns|Operator|Project|Description|Date|Time|Channels"
     r"|Samples|X0|\*\*\*End_of_Header)"
 )
+MINUS_BEHIND = re.compile(r"((?<![^\s;,|\"])\d+[.,]?\d*-|(?<=[\t;,|])\(\d+[.,]\d+\))(?![^\s;,|\"])")
+PUT_BEFORE = "export with the minus before the number, not behind it and not as brackets"
 _GROUPS = ((",", r"\."), (".", ","), (" ", "[.,]"), ("'", "[.,]"), ("’", "[.,]"))
 """Signs between thousands, and what may stand before the decimals then."""
+_BROKEN = re.compile(r'(?<![^\n,;\t])"[^",;\t\r\n]*(?:[\r\n]+[^",;\t\r\n]*){1,3}"(?![^\r\n,;\t])')
+_BYTE = "[,;\t](0x)?[0-9A-Fa-f]{2}"
 _CAN = "frames of a CAN bus, whose bytes mean nothing without their data base (DBC)"
 _DECODE = "decode them, for example with `cantools`, `asammdf` or the logger, to a CSV of signals"
 _PIVOT = (
@@ -41,6 +45,7 @@ _PIVOT = (
     ' |> pivot(rowKey: ["_time"], columnKey: ["_field"], valueColumn: "_value") in Flux'
 )
 _FOREIGN = (
+    (re.compile(rf"\d+\.\d+[,;\t]\w+[,;\t][1-8](?=.*[A-Fa-f])({_BYTE}){{1,8}}\Z"), _CAN, _DECODE),
     (re.compile(r"\s*\(\d+\.\d+\)\s+\w+\s+[0-9A-F]+#"), _CAN, _DECODE),
     (re.compile(r"\s*(\(\S+\)\s+)?\w+\s+[0-9A-F]{3,8}\s+\[\d+\]\s"), _CAN, _DECODE),
     (re.compile(r"\s*\d+\.\d+\s+\d+\s+[0-9A-Fa-f]+x?\s+[RT]x\s+d "), _CAN, _DECODE),
@@ -86,6 +91,11 @@ _ALIKE = {
 """Forms of lines that are each written in one way."""
 
 
+def unbroken(text: str) -> str:
+    """The text without line ends in quoted names, as spreadsheets write them."""
+    return _BROKEN.sub(lambda name: re.sub(r"[\r\n]+", " ", name[0]), text)
+
+
 def find_form(head: str) -> Form | None:
     """The form of a text that begins with ``head`` (whole lines); None of a table as it is.
 
@@ -98,9 +108,7 @@ def find_form(head: str) -> Form | None:
     if any(sign in head for sign in _TYPESET):
         plain = str.maketrans(_TYPESET)
         inner = find_form(head.translate(plain)) or Form("", str)
-        said = "; ".join(
-            filter(None, ("typeset minus signs and blanks are plain ones", inner.said))
-        )
+        said = "; ".join(filter(None, ("typeset minus signs and blanks made plain", inner.said)))
         return Form(said, lambda line: inner.rewrite(line.translate(plain)), inner.names)
     if found := _of_program(head, whole):
         return found
@@ -115,6 +123,9 @@ def find_form(head: str) -> Form | None:
     for find in (_protocol_fields, _elements, _PAIR.findall):
         if pairs := _pairs(lines, find):
             return pairs
+    behind = [match[0] for line in lines if (match := MINUS_BEHIND.search(line))]
+    if len(behind) > max(_FEWEST, (1.0 - _MOST) * len(lines)):
+        raise InputError(f"'{behind[0]}' may be a negative number", remedy=PUT_BEFORE)
     for delimiter in (*_DELIMITERS, " "):
         table = [cells(line, delimiter) for line in (*whole[:_TRIED], *lines)]
         width = Counter(map(len, table)).most_common(1)[0][0]
@@ -166,9 +177,7 @@ def _of_program(head: str, whole: Sequence[str]) -> Form | None:
 
 def _grouped(table: Sequence[list[str]], delimiter: str) -> Form | None:
     """The form of a table with digits in thousands, where no number has their sign otherwise."""
-    numbers = [
-        cell for row in table for cell in row if re.match(r"[-+\d]", cell) and not is_moment(cell)
-    ]
+    numbers = [x for row in table for x in row if re.match(r"[-+\d]", x) and not is_moment(x)]
     for sign, decimal in _GROUPS:
         if sign == delimiter == " ":
             continue
@@ -194,9 +203,7 @@ def _are(kind: re.Pattern[str], lines: Sequence[str]) -> bool:
 def _stamped(lines: Sequence[str]) -> Form:
     inner = [match[2] for match in map(_STAMPED.match, lines) if match]
     pairs = _pairs(inner, _PAIR.findall)
-    joint = (
-        "," if pairs else next((d for d in _DELIMITERS if _are(re.compile(f"[{d}]"), inner)), " ")
-    )
+    sep = "," if pairs else next((d for d in _DELIMITERS if _are(re.compile(f"[{d}]"), inner)), " ")
 
     def rewrite(line: str) -> str:
         match = _STAMPED.match(line)
@@ -204,7 +211,7 @@ def _stamped(lines: Sequence[str]) -> Form:
             return line
         rest = pairs.rewrite(match[2]) if pairs else match[2]
         stamp = match[1].replace(",", ".") if re.search(r"\d", rest) else "time"
-        return f"{stamp}{joint}{rest}"
+        return f"{stamp}{sep}{rest}"
 
     return Form("times stand before each line", rewrite, ("time", *pairs.names) if pairs else ())
 
@@ -267,10 +274,8 @@ def _cells(header: list[str], rows: list[list[str]], delimiter: str) -> Form | N
 
         def rewrite(line: str) -> str:
             row = cells(line, delimiter)
-            places = [row[2] if row[1] == name else "" for name in names] if len(row) == 3 else []
-            return delimiter.join(
-                [row[0], *(names if row == header else places)] if places else row
-            )
+            own = [row[2] if row[1] == name else "" for name in names] if len(row) == 3 else []
+            return delimiter.join([row[0], *(names if row == header else own)] if own else row)
 
         return Form(f"a reading a row, of {', '.join(names)} in turn", rewrite)
     return None
@@ -284,9 +289,7 @@ def _by_cell(
         if len(row) != len(of):
             return line
         pairs = zip(row, of, strict=True)
-        return delimiter.join(
-            new for cell, own in pairs for new in (act(cell, own) if own else [cell])
-        )
+        return delimiter.join(x for cell, own in pairs for x in (act(cell, own) if own else [cell]))
 
     return rewrite
 

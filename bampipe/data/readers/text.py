@@ -99,8 +99,10 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
             # A logger reserves space that it does not fill, or loses power before it has.
             stream = io.BytesIO(stream.read().replace(b"\0", b""))
         whole = head[: head.rfind(b"\n") + 1] or head
-        form = rewriting.find_form(whole.decode(encoding, "ignore").removeprefix("\ufeff"))
-        if encoding == "utf-8" and form is None:
+        plain = whole.decode(encoding, "ignore").removeprefix("\ufeff")
+        names = rewriting.unbroken(plain)
+        form, broken = rewriting.find_form(names), names != plain
+        if encoding == "utf-8" and form is None and not broken:
             yield stream, dialect, ()
             return
         try:
@@ -112,6 +114,7 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
             ) from error
         taken = "" if dialect.encoding else _TAKEN_AS.get(encoding, "")
         said = (f"not UTF-8: names and units are taken as {taken}",) if taken else ()
+        text = rewriting.unbroken(text) if broken else text
         if form is not None:
             text = re.sub(r"[^\r\n]+", lambda line: form.rewrite(line[0]), text)
             said = (*said, form.said) if form.said else said
@@ -397,9 +400,7 @@ def _fault(message: str, layout: TableLayout, line: Line | None) -> InputError:
         clock = re.search(r"\d+:\d\d:\d\d,\d+", text) if layout.delimiter == "," else None
         remedy = "the line is damaged: take it out of the file"
         if commas:
-            remedy = (
-                "decimal commas? export with semicolons between columns, or points as decimal sign"
-            )
+            remedy = "decimal commas? put semicolons between columns, or points as decimal sign"
         elif clock and actual > expected:
             remedy = (
                 f"the comma in '{clock[0]}' separates columns, too: export with semicolons between"
@@ -415,7 +416,7 @@ def _fault(message: str, layout: TableLayout, line: Line | None) -> InputError:
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     other = "," if layout.decimal == "." else "."
     sign = re.fullmatch(rf"\s*[-+]?\d+{re.escape(other)}\d+\s*", value)
-    remedy = ""
+    remedy = rewriting.PUT_BEFORE if rewriting.MINUS_BEHIND.search(f";{value}") else ""
     if sign:
         remedy = f"export with one decimal sign; '{layout.decimal}' was taken from the first rows"
     elif re.fullmatch(r"\s*[-+]?\d{1,3}([ .,'’]\d{3})+([.,]\d*)?\s*", value):
