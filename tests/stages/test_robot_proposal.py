@@ -355,10 +355,15 @@ def test_files_of_which_none_is_that_of_the_robot_are_refused(tmp_path: Path) ->
         propose(tmp_path)
 
 
-def test_several_positions_without_a_urdf_may_be_those_of_joints(tmp_path: Path) -> None:
-    write_log(tmp_path)
-    (tmp_path / "arm.urdf").unlink()
-    assert any("put its URDF beside the logs" in line for line in propose(tmp_path).check)
+def test_columns_may_lack_what_all_joints_are_called(tmp_path: Path) -> None:
+    names = {"q1": "Shoulder angle", "q2": "Elbow angle", "tau1": "Shoulder Nm", "tau2": "Elbow Nm"}
+    table = write_log(tmp_path).rename(columns=names)
+    table[[*table.columns[[0, 2, 1, 4, 3]]]].to_parquet(tmp_path / "log.parquet")
+    urdf = URDF.replace('name="shoulder"', 'name="shoulder_lift"')
+    (tmp_path / "arm.urdf").write_text(urdf.replace('name="elbow"', 'name="elbow_lift"'))
+    session = propose(tmp_path).session
+    assert 'elbow_lift = { column = "Elbow angle"' in session
+    assert 'torque_shoulder_lift = { column = "Shoulder Nm"' in session
 
 
 @pytest.mark.parametrize(
@@ -368,9 +373,7 @@ def test_several_positions_without_a_urdf_may_be_those_of_joints(tmp_path: Path)
         (f"<mujoco>{'<body>' * 300}{'</body>' * 300}</mujoco>", "nested more than 200 deep"),
     ],
 )
-def test_an_mjcf_that_cannot_be_read_is_not_passed_over(
-    tmp_path: Path, text: str, said: str
-) -> None:
+def test_an_mjcf_that_cannot_be_read_is_not_skipped(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "arm.xml").write_text(text)
     t = np.arange(400) / 100.0
     table = pd.DataFrame({"t": t, "position": np.sin(t), "current": np.cos(t)})
@@ -431,9 +434,7 @@ def test_joints_counted_otherwise_than_drawn(
         pytest.param((0.0, 1.0, -1.0), id="tilted"),
     ],
 )
-def test_gravity_of_a_base_that_does_not_stand(
-    tmp_path: Path, down: tuple[float, float, float]
-) -> None:
+def test_gravity_of_a_base_that_lies(tmp_path: Path, down: tuple[float, float, float]) -> None:
     """With a joint that counts the other way, and a drive that is turned."""
     gravity = 9.81 * np.array(down) / np.linalg.norm(down)
     record_logs(
@@ -475,9 +476,7 @@ HAND = "".join(
 )
 
 
-def test_a_robot_of_which_the_urdf_shows_more_ends_with_the_last_joint_logged(
-    tmp_path: Path,
-) -> None:
+def test_a_robot_whose_urdf_shows_more_ends_with_the_last_joint_logged(tmp_path: Path) -> None:
     """A service robot: wheels on the base, fingers behind the arm."""
     write_log(tmp_path)
     wheel = HAND.replace("lower", "base").replace("left", "wheel_a").replace("right", "wheel_b")

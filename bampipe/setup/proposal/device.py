@@ -21,18 +21,10 @@ from bampipe.lists import join_names
 from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
 from bampipe.setup.hypotheses import MOST_TRAVEL
+from bampipe.setup.proposal import positions
 from bampipe.setup.proposal.joints import chain_logged
 from bampipe.setup.proposal.matching import Matcher
-from bampipe.setup.proposal.positions import (
-    SLIDING,
-    in_counts,
-    is_force,
-    is_velocity,
-    needs_gain,
-    position_in_si,
-    scale_to,
-    slides,
-)
+from bampipe.setup.proposal.positions import SLIDING, in_counts, is_velocity, needs_gain
 from bampipe.setup.proposal.starter import Drive, starter_device, weight_of
 
 DEVICE = "device.toml"
@@ -47,6 +39,8 @@ _NEAR = 0.05
 """Share by which what a radian reads by the weight may differ from that of its unit."""
 _SAME_DRIVE = 0.8
 """Correlation beyond which a current and a force are of one drive: that of a coil has its own."""
+
+_Motors = Mapping[str, tuple[float, float | None]]
 
 
 @dataclass(frozen=True)
@@ -97,9 +91,7 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
     Where joints branch, as fingers do, it ends with the last one that has a column, else before
     them. InputError where the file cannot be used, is a xacro file, or there are several.
     """
-    urdfs = sorted(folder.glob("*.urdf")) or [
-        path for path in sorted(folder.glob("*.xml")) if _is_mjcf(path)
-    ]
+    urdfs = sorted(folder.glob("*.urdf")) or [*filter(_is_mjcf, sorted(folder.glob("*.xml")))]
     if not urdfs:
         macros = next(iter(sorted(folder.glob("*.xacro"))), None)
         if macros is not None:
@@ -133,10 +125,7 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
 
 
 def with_motors(
-    folder: Path,
-    chosen: ChosenDevice,
-    motors: Mapping[str, tuple[float, float | None]],
-    reference: str = "",
+    folder: Path, chosen: ChosenDevice, motors: _Motors, reference: str = ""
 ) -> ChosenDevice:
     """A new device file of a robot with a table for each motor.
 
@@ -178,9 +167,7 @@ def _device_file(folder: Path, wanted: str) -> ChosenDevice:
     full, root = path.resolve(), folder.resolve()
     if not full.is_relative_to(root):
         raise InputError(
-            "the device file is not in the folder of the logs",
-            where=wanted,
-            remedy=f"copy it to {folder}",
+            "the device file is not beside the logs", where=wanted, remedy=f"copy it to {folder}"
         )
     return ChosenDevice(full.relative_to(root).as_posix(), device)
 
@@ -216,7 +203,7 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
             where=f"{folder}: {found.trials[0].file}",
             remedy=f"{way}; columns are {', '.join(c.name for c in found.columns[:12])}",
         )
-    linear = slides(position, found)
+    linear = positions.slides(position, found)
     driver, role = match.driver(position)
     supply = match.supply(driver) if role == "duty" else None
     coil = role == "force" and _has_coil(driver, match)
@@ -233,7 +220,9 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
         )
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
     if driver is not None:
-        levered = driver.si == "V" or needs_gain(driver) or (not linear and is_force(driver))
+        levered = (
+            driver.si == "V" or needs_gain(driver) or (not linear and positions.is_force(driver))
+        )
         drive = replace(drive, scaled=role == "force" and not levered)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     springs = fit.pose is not None and fit.pose.reading == "spring"
@@ -321,7 +310,7 @@ def _at_joint(
 def _may_be_geared(position: SurveyedColumn) -> bool:
     """Whether an angle is rather a motor's before its gear: by its name, in turns, or by travel."""
     travel = float(np.ptp(position.values)) * position.scale
-    of_motor = "motor" in words(position.name) or unit(position.unit) == unit("rev")
+    of_motor = positions.is_of_motor(position) or unit(position.unit) == unit("rev")
     return position.si == "rad" and (of_motor or travel > MOST_TRAVEL)
 
 
@@ -334,7 +323,7 @@ def _sign_width(position: SurveyedColumn, t: np.ndarray, linear: bool) -> float:
     """
     kind = "linear" if linear else "rotary"
     si, _, usual = KINDS[kind]
-    q = position_in_si(position, t, si)
+    q = positions.position_in_si(position, t, si)
     step = counting_step(q)
     step = max(step, float(np.sqrt(12.0)) * float(np.nan_to_num(white_noise_sd(q, t, step))))
     width = max(step / float(np.median(np.diff(t))) / 40.0, usual / 20.0)
@@ -348,8 +337,8 @@ def _rough_fit(
     if driver is None:
         return guesses.Driven(0.0)
     si = {"current": "A", "voltage": "V", "duty": ""}.get(role, "N" if linear else "N.m")
-    drive = np.nan_to_num(driver.values * scale_to(si, driver))
-    q = position_in_si(position, t, "m" if linear else "rad")
+    drive = np.nan_to_num(driver.values * positions.scale_to(si, driver))
+    q = positions.position_in_si(position, t, "m" if linear else "rad")
     counted = in_counts(position)
     found = guesses.driven(t, q, drive, angle=not linear and not counted)
     # Sizes per count would pass for sizes per radian or metre.

@@ -57,9 +57,7 @@ def pair_joints(
     positions = _groups(joints, found.of("position"))
     some: dict[str, SurveyedColumn] = {}
     if not drives and positions:
-        incomplete = [
-            g for role in roles for g in _incomplete(motors, found.of(role), positions[0])
-        ]
+        incomplete = [g for r in roles for g in _incomplete(motors, found.of(r), positions[0])]
         most = max(incomplete, key=len, default={})
         some = {name: most[m] for name, m in zip(device.forces, motors, strict=True) if m in most}
     return positions, drives, some
@@ -95,9 +93,13 @@ def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Gro
     """Groups with a column for each of ``names``, by their names first; a column is in one."""
     split = {column.name: _tokens(column.name, column.unit) for column in columns}
     wanted = {name: _tokens(name) for name in names}
-    bare = {name: tuple(t for t in said if t not in _GENERAL) for name, said in wanted.items()}
+    shared = set.intersection(*map(set, wanted.values())) if len(names) > 1 else set[str]()
+    bare, own = (
+        {name: tuple(t for t in said if t not in less) for name, said in wanted.items()}
+        for less in (_GENERAL, _GENERAL | shared)
+    )
     found: list[Group] = []
-    for said in (wanted, bare):
+    for said in (wanted, bare, own):
         if all(said.values()) and len(set(said.values())) == len(names):
             found += [
                 Group(tuple(group[name] for name in said), named=True)

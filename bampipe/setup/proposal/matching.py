@@ -10,7 +10,7 @@ from bampipe.data import guesses
 from bampipe.data.session import Register
 from bampipe.data.survey import DRIVERS, REFERENCE_WORDS, Survey, SurveyedColumn, words
 from bampipe.setup.proposal.notes import Notes
-from bampipe.setup.proposal.positions import travelled
+from bampipe.setup.proposal.positions import is_of_motor, travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
 _NO_LESS = 0.03
@@ -77,7 +77,7 @@ class Matcher:
         # A test stand may log the velocity only, which is integrated then.
         found = found or [c for c in moving if c.role == "velocity"]
         found = found or [c for c in moving if c.name in ("v", "V")]
-        found = [c for c in found if "motor" not in words(c.name)] or found
+        found = [c for c in found if not is_of_motor(c)] or found
         if len(found) < 2:
             return found[0] if found else None
         best = found[0]
@@ -94,6 +94,25 @@ class Matcher:
         most = max(found, key=lambda c: share[c.name])
         clear = 1.0 - share[most.name] < guesses.CLEARLY * (1.0 - share[best.name])
         return most if clear and share[most.name] >= guesses.MOVED else best
+
+    def of_another(self, position: SurveyedColumn) -> dict[str, str]:
+        """Columns of another joint or trial, alike but for a number, by those of ``position``.
+
+        None unless what drives that position has such a number, too.
+        """
+        bare = ((c.name, re.sub(r"[\[(]\D*[\])]", "", c.name)) for c in self.found.columns)
+        split = {name: re.split(r"(\d+|\b[A-Z]\b)", said) for name, said in bare}
+        own = split[position.name]
+        alike = (split[name] for name in self.rivals if split[name][::2] == own[::2])
+        other = next((parts for parts in alike if parts != own), own)
+        pairs = {
+            name: called
+            for name in (*self.used, *(c.name for c in self.given.values()))
+            for called, parts in split.items()
+            if split[name][1::2] == own[1::2] != parts[1::2] == other[1::2]
+            and split[name][::2] == parts[::2]
+        }
+        return pairs if any(c.name in pairs for c in self.found.of(*DRIVERS)) else {}
 
     def _share(self, position: SurveyedColumn, column: SurveyedColumn) -> float:
         """The share of a column that the motion of a position explains, 0 if it is the position."""

@@ -1,5 +1,6 @@
 """What the readings of a log stand for, and positions in SI."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -27,9 +28,15 @@ def is_velocity(column: SurveyedColumn) -> bool:
     return column.role == "velocity" or column.name in ("v", "V")
 
 
+def is_of_motor(column: SurveyedColumn) -> bool:
+    """Whether an angle is that of a motor or of its field, by its name."""
+    return not {"motor", "rotor", "elec", "electrical"}.isdisjoint(words(column.name))
+
+
 def in_counts(column: SurveyedColumn) -> bool:
-    """Whether a position is in whole counts of no known unit."""
-    return column.si is None and column.is_integer and bool(np.ptp(column.values) > _FEWEST_COUNTS)
+    """Whether a position is in whole counts of no known unit, and nothing tells their size."""
+    unsaid = column.si is None and not re.search(r"\d", column.stated)
+    return unsaid and column.is_integer and bool(np.ptp(column.values) > _FEWEST_COUNTS)
 
 
 def is_force(column: SurveyedColumn) -> bool:

@@ -31,9 +31,7 @@ _MIXED = 0.1
 """Share of steps at which times fall that are all different, of rows that stand out of order."""
 _SLOW_HZ = 40.0
 """Below, accelerations of a joint that stops within a tenth of a second are not seen."""
-_OF_ROWS = (
-    "the logger's set-up has it; else the number of rows over the seconds that the recording took"
-)
+_OF_ROWS = "the logger's set-up has it; else the number of rows over the seconds that they took"
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
 _SURE, _NEAR = 2.0, 0.025
 """Standard errors, and share, within which a power of two, as most encoders count, is what a turn
@@ -218,6 +216,15 @@ def encoders_table(device: Device, match: Matcher) -> tuple[list[str], dict[str,
         if register := match.registers.get(column.name):
             table = table.replace(" }", f"{register.fields} }}", 1)
             match.notes.check.append(f"{column.name} is {register.words}")
+        if pairs := match.of_another(column):
+            named = ", ".join(f"{quoted(one)} = {quoted(other)}" for one, other in pairs.items())
+            table = table.replace(quoted(column.name), quoted(UNKNOWN), 1) + match.notes.ask(
+                f"which is meant, {column.name} or {pairs[column.name]}: are they of two joints, or"
+                " trials of one?",
+                "of a robot's joints, name one, or put its URDF beside the logs; of trials, name"
+                f" {column.name}, and list the file again for each other, with columns ="
+                f" {{ {named} }} in its [[trials]]",
+            )
         lines.append(f"{axis.name} = {table}")
     return [*lines, ""], axes
 
