@@ -8,20 +8,19 @@ import numpy as np
 
 from bampipe.arrays import Array, Flags
 
-STEPS = (1, 3, 12, 48, 192)
-"""Steps from one sample to the next, tried in turn until coupled states are followed stably."""
+STEP_ERROR = 1e-6
+"""Largest estimated error of a step of coupled states, of the largest value of a state."""
+LEAST_STEP = 2.0**-16
+"""Shortest step of coupled states, of the time from one sample to the next."""
 ACCURATE = 0.25
-"""Largest product of a step and a state's rate for a single step per sample: the error of RK4 is
-its fifth power over 120, 8e-6."""
+"""Largest product of a step, from one sample to the next, and the rate of an uncoupled state: the
+error is its fifth power over 720, 1.4e-6."""
 STIFF_STEPS = (3, 24)
 """Exponential steps from one sample to the next, which are stable, if no state depends on another:
 the fewer unless the more differ. The error of a hysteresis passed 300 times between two samples is
 at most 0.6 % at a reversal, 60 times 0.06 %."""
 TOLERANCE = 3e-4
 """Of the largest value of a state: by how much they may differ."""
-STABLE = 2.5
-"""Largest product of a step and the rate at which a state decays for which RK4 is stable, with a
-margin: it is up to 2.78 (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2)."""
 _STEP_AGAINST_NEIGHBOURS = 8.0
 """A command that changes between two samples this many times more than before and after has been
 switched. Ramps and sines change by at most twice as much from one sample to the next; noise of the

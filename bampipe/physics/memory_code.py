@@ -8,7 +8,7 @@ import sympy as sp
 
 from bampipe.physics.codegen import SCALAR_HEADER, filling_function
 from bampipe.physics.equations import Equations, join_overlapping
-from bampipe.physics.memory import ACCURATE, STABLE, STEPS, STIFF_STEPS, TOLERANCE
+from bampipe.physics.memory import ACCURATE, LEAST_STEP, STEP_ERROR, STIFF_STEPS, TOLERANCE
 
 _FEWEST = 3
 """Exponential steps per sample if the decay of a state depends on the motion."""
@@ -31,60 +31,62 @@ def between(q, qd, qdd, u, i, h, share, x, v, w):
         w[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
 '''
 
-# Coupled states take more steps between samples where a contact opens or closes, or they are stiff.
+# Kutta-Merson steps (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, II.4).
 MEMORY_LOOP = '''
 
 @njit(types.float64(M, M, M, M, V, V, V, M), cache=True, error_model='numpy')
 def memory(q, qd, qdd, u, p, t, z0, out):
-    """RK4 along the samples of a motion; fills out (T, n_z).
+    """Fourth-order steps along the samples of a motion, coupled ones as long as errors allow.
 
-    Returns 1, with the rest of out as it was, where exponential steps are called for; else 0.
+    Fills out (T, n_z). Returns 1, with the rest of out as it was, where exponential steps are
+    called for; else 0.
     """
     n = len(z0)
-    k1, k2, k3, k4 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    z, at = z0.copy(), np.empty(n)
+    k1, k2, k3, k4, k5 = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    z, at, largest, share = z0.copy(), np.empty(n), np.abs(z0), 1.0
     a, b, c = q[0].copy(), qd[0].copy(), u[0].copy()
     out[0] = z
     for i in range(len(t) - 1):
-        for steps in STEPS:
-            z[:], a[:], b[:], c[:] = out[i], q[i], qd[i], u[i]
-            h, fastest = (t[i + 1] - t[i]) / steps, 0.0
-            for s in range(2 * steps):
-                share = (s + 1) / (2 * steps)
-                if s % 2 == 0:
-                    memory_rate(a, b, c, p, z, k1)
-                    for j in range(n):
-                        at[j] = z[j] + 0.5 * h * k1[j]
-                between(q, qd, qdd, u, i, t[i + 1] - t[i], share, a, b, c)
-                if s % 2 == 0:
-                    memory_rate(a, b, c, p, at, k2)
-                    for j in range(n):
-                        at[j] = z[j] + 0.5 * h * k2[j]
-                    memory_rate(a, b, c, p, at, k3)
-                    moved, turned = 0.0, 0.0
-                    for j in range(n):
-                        moved += abs(k2[j] - k1[j])
-                        turned += abs(k3[j] - k2[j])
-                        at[j] = z[j] + 0.5 * h * k3[j]
-                    if COUPLED:
-                        # Of a swing, a position turns into a rate and back: twice around tells.
-                        memory_rate(a, b, c, p, at, k4)
-                        turned = 0.0
-                        for j in range(n):
-                            turned += abs(k4[j] - k3[j])
-                        turned = sqrt(turned * moved)
-                    for j in range(n):
-                        at[j] = z[j] + h * k3[j]
-                    if 2.0 * turned > fastest * moved and turned > 1e-12 * moved:
-                        fastest = 2.0 * turned / moved
-                else:
-                    memory_rate(a, b, c, p, at, k4)
-                    for j in range(n):
-                        z[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
-            if fastest < (STABLE if steps > 1 else ACCURATE):
-                break
-            if not COUPLED:
+        span, done, begun = t[i + 1] - t[i], 0.0, False
+        while done < 1.0:
+            share = min(share, 1.0 - done)
+            h = share * span
+            if not begun:
+                between(q, qd, qdd, u, i, span, done, a, b, c)
+                memory_rate(a, b, c, p, z, k1)
+                begun = True
+            for j in range(n):
+                at[j] = z[j] + h / 3.0 * k1[j]
+            between(q, qd, qdd, u, i, span, done + share / 3.0, a, b, c)
+            memory_rate(a, b, c, p, at, k2)
+            moved, turned, error = 0.0, 0.0, 0.0
+            for j in range(n):
+                at[j] = z[j] + h / 6.0 * (k1[j] + k2[j])
+                moved += abs(k2[j] - k1[j])
+            memory_rate(a, b, c, p, at, k3)
+            for j in range(n):
+                at[j] = z[j] + h / 8.0 * (k1[j] + 3.0 * k3[j])
+                turned += abs(k3[j] - k2[j])
+            if not COUPLED and 6.0 * turned >= ACCURATE * moved and turned > 1e-12 * moved:
                 return 1.0
+            between(q, qd, qdd, u, i, span, done + 0.5 * share, a, b, c)
+            memory_rate(a, b, c, p, at, k4)
+            for j in range(n):
+                at[j] = z[j] + h / 2.0 * (k1[j] - 3.0 * k3[j] + 4.0 * k4[j])
+            between(q, qd, qdd, u, i, span, done + share, a, b, c)
+            memory_rate(a, b, c, p, at, k5)
+            for j in range(n):
+                missed = h / 30.0 * abs(2.0 * k1[j] - 9.0 * k3[j] + 8.0 * k4[j] - k5[j])
+                error = max(error, missed / max(largest[j], 1e-300))
+            if COUPLED and error > ERROR and share > LEAST:
+                share *= 0.5
+                continue
+            for j in range(n):
+                z[j] += h / 6.0 * (k1[j] + 4.0 * k4[j] + k5[j])
+                largest[j] = max(largest[j], abs(z[j]))
+            done, begun = done + share, False
+            if 32.0 * error < ERROR or not COUPLED:
+                share *= 2.0
         out[i + 1] = z
     return 0.0
 '''
@@ -207,8 +209,8 @@ def memory_source(e: Equations, places: Sequence[int]) -> tuple[str, dict[str, l
 
     if coupled or any(slope.free_symbols & set(z_all) for slope in slopes):
         rate = filling_function("memory_rate", passed, {"dz": number_columns(rates)}, "")
-        head = f"import numpy as np\nCOUPLED, STEPS = {coupled}, {STEPS if coupled else (1,)}\n"
-        head += f"ACCURATE, STABLE = {ACCURATE}, {STABLE}\n"
+        head = f"import numpy as np\nCOUPLED, ACCURATE = {coupled}, {ACCURATE}\n"
+        head += f"ERROR, LEAST = {STEP_ERROR}, {LEAST_STEP}\n"
         head += f"STIFF_STEPS, TOLERANCE = {STIFF_STEPS}, {TOLERANCE}\n"
         source = SCALAR_HEADER + head + rate + BETWEEN + MEMORY_LOOP
         if not coupled:

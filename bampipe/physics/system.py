@@ -134,7 +134,7 @@ class System:
         """Each effect that changes how a force acts: numbers of its parameters, and it alone."""
         names, found = [q.name for q in self.parameters], list[tuple[list[int], System]]()
         for item in self.model.effects if self.driven or self.force_fed else ():
-            if item.effect.ahead is not None:
+            if item.effect.has_play:
                 continue
             alone = compile_model(Model(self.model.device, (item.name,), (item.effect,)))
             if alone.driven or alone.force_fed:
@@ -401,10 +401,10 @@ class System:
     ) -> Array:  # fmt: skip
         """Internal states along the motion of one trial, (T, n_z), and rates of change after them.
 
-        Integrated by RK4, or by exponential steps where its rate is linear in the state, along
-        rates that are cubic between samples and inputs that are linear, in finer steps if a state
-        would diverge. A command or channel that is switched holds until the sample that first shows
-        its new value.
+        Integrated in steps of fourth order, or exponential ones where its rate is linear in the
+        state, along rates that are cubic between samples and inputs that are linear. Coupled states
+        take shorter steps where a contact opens or closes. A command or channel that is switched
+        holds until the sample that first shows its new value.
 
         Args:
             q, qd, qdd, u, p: as in `required`.
