@@ -17,14 +17,7 @@ from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
-from bampipe.identification.filter_run import (
-    Attempt,
-    FilterRun,
-    build_filter_model,
-    choose_stride,
-    follow_trials,
-    load_filter_trial,
-)
+from bampipe.identification import filter_run
 from bampipe.identification.filter_tables import tabulate_trace
 from bampipe.identification.sensor_noise import FilterChoice, sensor_noise, untuned_settings
 from bampipe.physics import Model, System, compile_model
@@ -118,24 +111,24 @@ def _estimated(
     if identified.noise is not None and config.force_noise == 0.0:
         found_sd = [identified.noise.process_sd[name] for name in system.noise]
         settings = settings._replace(noise_sd=np.array(found_sd))
-    stride = choose_stride(motions)
+    stride = filter_run.choose_stride(motions)
     settings = settings._replace(stride=stride)
     brakes = [name in system.model.device.brakes.values() for name in system.inputs]
     readings = []
     for motion in motions:
-        trial = load_filter_trial(run, motion, system, start, noise, stride, config)
+        trial = filter_run.load_filter_trial(run, motion, system, start, noise, stride, config)
         readings.append(replace(trial, u=np.where(brakes, 0.0, trial.u)))
     free = [item for item in system.parameters if not item.fixed]
     late_s = identified.input_timing.estimate
-    model = build_filter_model(system, readings, start, False, late_s)
+    model = filter_run.build_filter_model(system, readings, start, False, late_s)
     command = float(np.nanmean(commanded)) if np.isfinite(commanded).any() else None
     estimates = {name: one.estimate for name, one in known.items()}
     value = np.array([estimates.get(item.name, command or 0.0) for item in free])
     sd = np.array([known[item.name].sd if item.name in known else item.sd for item in free])
     sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
 
-    attempts: list[Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
-    found = follow_trials(
+    attempts: list[filter_run.Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
+    found = filter_run.follow_trials(
         model,
         readings,
         config,
@@ -174,7 +167,9 @@ def _estimated(
     return result, frame
 
 
-def _block_sd(found: FilterRun, n_states: int, field: Sequence[int]) -> tuple[Array, int]:
+def _block_sd(
+    found: filter_run.FilterRun, n_states: int, field: Sequence[int]
+) -> tuple[Array, int]:
     """Return standard deviations of the ``field`` from the scatter of blocks, and their number.
 
     Identified parameters are known so much better than the field that these trials hardly move

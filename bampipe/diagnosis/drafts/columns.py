@@ -12,18 +12,7 @@ import numpy as np
 
 from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.dictionary import Atom, Key
-from bampipe.diagnosis.drafts.forms import (
-    CURVED,
-    DAMPING,
-    FORCE,
-    FRICTION,
-    GRAMMAR,
-    INERTIA,
-    READING,
-    Form,
-    Span,
-    list_quantities,
-)
+from bampipe.diagnosis.drafts import forms
 from bampipe.diagnosis.drafts.shapes import SHAPES
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.trials.linearisation import Linearisation
@@ -59,7 +48,7 @@ class FormDictionary:
 
     def __init__(self, linearisation: Linearisation, samples: Sequence[Samples], axis: int) -> None:
         self.linearisation, self.samples, self.axis = linearisation, samples, axis
-        self.candidates: dict[str, Form] = {}
+        self.candidates: dict[str, forms.Form] = {}
         self.starts: dict[str, Mapping[str, float]] = {}
 
     def add_grammar(self, curves: bool = False, left: Array | None = None) -> None:
@@ -71,16 +60,16 @@ class FormDictionary:
         if left is not None:
             spans = {n: self._where_left(n, span, left) for n, span in spans.items()}
         device = self.linearisation.system.model.device
-        for quantity in list_quantities(device, self.axis):
+        for quantity in forms.list_quantities(device, self.axis):
             if quantity.words not in spans:
                 continue  # it does not vary
-            for (kind, own, factor), shapes in (CURVED if curves else GRAMMAR).items():
+            for (kind, own, factor), shapes in (forms.CURVED if curves else forms.GRAMMAR).items():
                 if (kind, own) != (quantity.quantity, quantity.axis == self.axis):
                     continue
                 for shape in shapes:
                     if shape == "ripple" and kind == "position" and own and device.drive:
                         continue  # the library has the ripple of a motor
-                    form = Form(
+                    form = forms.Form(
                         device.coordinates[self.axis], self.axis, factor, SHAPES[shape], quantity,
                         spans[quantity.words], self.times, self.scales.get(factor, 1.0),
                     )  # fmt: skip
@@ -122,7 +111,7 @@ class FormDictionary:
     def spreads(self, name: str) -> list[float]:
         """Return the prior standard deviation of each strength, that of the applied force."""
         form = self.candidates[name]
-        size = self._sizes[form.coordinate.words if form.factor == READING else _LOAD]
+        size = self._sizes[form.coordinate.words if form.factor == forms.READING else _LOAD]
         return [max(size, 1e-300)] * len(form.shape.strengths)
 
     def make(self, key: Key) -> Atom | None:
@@ -130,7 +119,7 @@ class FormDictionary:
         form, searched = self.candidates[key[0]], self.values(key)
         constants = form.constants_at(searched, 1.0 / self._rate_hz)
         # An error of a reading acts on every axis that the force drives.
-        axes = range(len(self.samples)) if form.factor == READING else [self.axis]
+        axes = range(len(self.samples)) if form.factor == forms.READING else [self.axis]
         rows: dict[int, list[Array]] = {axis: [] for axis in axes}
         slopes: dict[int, list[Array]] = {axis: [] for axis in axes}
         for i, (_, kept) in enumerate(self._sampling):
@@ -140,15 +129,17 @@ class FormDictionary:
             for axis in axes:
                 lever = self._lever(form, axis, i) / form.scale
                 acting = values * lever
-                if form.factor == INERTIA:
+                if form.factor == forms.INERTIA:
                     # Lagrange's equation for the kinetic energy.
                     turning = (
-                        np.gradient(values, axis=0) * self._rate_hz * self._signals[DAMPING][i]
+                        np.gradient(values, axis=0)
+                        * self._rate_hz
+                        * self._signals[forms.DAMPING][i]
                     )
                     acting = -acting - (0.5 if form.is_own else 1.0) * turning / form.scale
                 cutoff = float(self.linearisation.band.cutoff_hz[axis])
                 rows[axis].append(low_pass_at(acting, cutoff, self._rate_hz, kept))
-                if form.coordinate.quantity in (_LOAD, READING):
+                if form.coordinate.quantity in (_LOAD, forms.READING):
                     slope = _slopes(values, x[:, 0])[kept] * lever[kept]
                     slopes[axis].append(slope[:, None, :] * self._by_forces(form, i, kept))
         here = {axis: np.concatenate(r)[self.samples[axis].rows] for axis, r in rows.items()}
@@ -170,14 +161,14 @@ class FormDictionary:
         ]
         return np.asarray(np.concatenate(found)[self.samples[self.axis].rows])
 
-    def _where_left(self, words: str, span: Span, left: Array) -> Span:
+    def _where_left(self, words: str, span: forms.Span, left: Array) -> forms.Span:
         """Return the part of the range of a quantity that contains nearly all of a residual."""
         at = self.thin(words)
         order = np.argsort(at, kind="stable")
         mass = np.cumsum(left[order] ** 2)
         ends = np.searchsorted(mass, mass[-1] * np.array([0.005, 0.995]))
         low, high = at[order][np.minimum(ends, len(at) - 1)] + 0.03 * span.width * np.array([-1, 1])
-        return Span(max(float(low), span.low), min(float(high), span.high))
+        return forms.Span(max(float(low), span.low), min(float(high), span.high))
 
     @cached_property
     def _sampling(self) -> list[tuple[slice, Indices]]:
@@ -215,9 +206,9 @@ class FormDictionary:
             u, z = motion.inputs(system.inputs)[rows], fitted.memory[rows]
             applied = system.applied(q, qd, qdd, z, u, e.p)[:, axis]
             sign = np.tanh(qd[:, axis] / device.coordinates[axis].sign_width)
-            values = {_APPLIED: applied, FRICTION: sign}
-            values |= {DAMPING: qd[:, axis], INERTIA: qdd[:, axis]}
-            for c in list_quantities(device, axis):
+            values = {_APPLIED: applied, forms.FRICTION: sign}
+            values |= {forms.DAMPING: qd[:, axis], forms.INERTIA: qdd[:, axis]}
+            for c in forms.list_quantities(device, axis):
                 by_quantity = {
                     "position": q[:, c.axis],
                     "speed": np.abs(qd[:, c.axis]),
@@ -242,46 +233,49 @@ class FormDictionary:
             found.append(np.asarray(e.system.input_map(motion.q[rows], u, e.p)))
         return found
 
-    def _lever(self, form: Form, axis: int, trial: int) -> Array:
+    def _lever(self, form: forms.Form, axis: int, trial: int) -> Array:
         """Return the factor on the shape of a form on an axis, (T, 1)."""
-        if form.factor == READING:
+        if form.factor == forms.READING:
             component = self.linearisation.system.model.device.forces.index(form.coordinate.channel)
             return -self._pulls[trial][:, axis, [component]]
-        return np.ones((1, 1)) if form.factor == FORCE else self._signals[form.factor][trial]
+        return np.ones((1, 1)) if form.factor == forms.FORCE else self._signals[form.factor][trial]
 
-    def _by_forces(self, form: Form, trial: int, kept: Indices) -> Array:
+    def _by_forces(self, form: forms.Form, trial: int, kept: Indices) -> Array:
         """Return the slope of a form's quantity by the measured forces, (K, n_forces, 1)."""
         forces = self.linearisation.system.model.device.forces
-        if form.factor == READING:
+        if form.factor == forms.READING:
             return np.array([[[float(f == form.coordinate.channel)] for f in forces]])
         pulls, applied = self._pulls[trial][kept, self.axis], self._signals[_APPLIED][trial][kept]
         return np.asarray(pulls * np.sign(applied))[:, :, None]
 
     @cached_property
-    def spans(self) -> dict[str, Span]:
+    def spans(self) -> dict[str, forms.Span]:
         """The range of each quantity that varies."""
         words = [
-            c.words for c in list_quantities(self.linearisation.system.model.device, self.axis)
+            c.words
+            for c in forms.list_quantities(self.linearisation.system.model.device, self.axis)
         ]
         ends = {n: np.quantile(np.concatenate(self._signals[n]), _RANGE) for n in words}
-        return {n: Span(float(a), float(b)) for n, (a, b) in ends.items() if b - a > 1e-9}
+        return {n: forms.Span(float(a), float(b)) for n, (a, b) in ends.items() if b - a > 1e-9}
 
     @cached_property
     def scales(self) -> dict[str, float]:
         """Highest speed and acceleration of the axis."""
         largest = {
             f: float(np.quantile(np.abs(np.concatenate(self._signals[f])), _RANGE[1]))
-            for f in (DAMPING, INERTIA)
+            for f in (forms.DAMPING, forms.INERTIA)
         }
         return {f: value for f, value in largest.items() if value > 0.0}
 
     @cached_property
-    def times(self) -> Span:
+    def times(self) -> forms.Span:
         """Time between samples and of a trial, s."""
         trials = [motion.t for motion in self.linearisation.motions]
-        return Span(float(np.median(np.diff(trials[0]))), max(float(np.ptp(t)) for t in trials))
+        return forms.Span(
+            float(np.median(np.diff(trials[0]))), max(float(np.ptp(t)) for t in trials)
+        )
 
-    def _points(self, form: Form) -> list[dict[str, float]]:
+    def _points(self, form: forms.Form) -> list[dict[str, float]]:
         """Return the grid of the searched constants of a form."""
         span, names = form.span, tuple(form.shape.searched)
         lengths, most = span.width * np.geomspace(*_LENGTHS), _MOST_WAVES
@@ -301,7 +295,7 @@ class FormDictionary:
         return [dict(zip(names, map(float, point), strict=True)) for point in grids[names]]
 
 
-def _places(span: Span, length: float) -> Array:
+def _places(span: forms.Span, length: float) -> Array:
     """Return places along a span, close enough for a shape of the given length."""
     count = max(4, int(np.ceil(span.width / (_NEAREST * length))))
     return np.asarray(span.low + span.width * (np.arange(count) + 0.5) / count)
