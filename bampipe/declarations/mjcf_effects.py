@@ -209,7 +209,7 @@ _WRITERS: Mapping[str, _Act] = {
     **dict.fromkeys(("return_spring", "cable_torque"), _spring),
     "quadratic_drag": _drag,
     **dict.fromkeys(("upper_stop", "lower_stop"), _stop),
-    **dict.fromkeys(("flexible_load", "loose_load"), _load),
+    **dict.fromkeys(("flexible_load", "loose_link"), _load),
     "presliding": _presliding,
     "stribeck": _stribeck,
     **{

@@ -1,7 +1,6 @@
 """The columns that candidates add to the residual, each computed once per shape."""
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -78,11 +77,11 @@ class Dictionary:
         ranges = self.ranges[name]
         each = _ALONE if len(ranges) == 1 else _SEVERAL
         counts = [
-            max(each + _MORE * (r.by_ratio and r.high / r.low > _WIDE), r.grid_size) for r in ranges
+            r.count or max(each + _MORE * (r.by_ratio and r.high / r.low > _WIDE), r.grid_size)
+            for r in ranges
         ]
         states = self.candidates[name].system.model.effects[-1].effect.states
-        most = _MOST_OF_STATES if len(ranges) > 3 else _MOST_OF_THREE
-        most = max(most if states else _MOST, math.prod(r.least_count for r in ranges))
+        most = (_MOST_OF_STATES if len(ranges) > 3 else _MOST_OF_THREE) if states else _MOST
         while np.prod(counts) > most:
             dense = [(n - 1) / r.extent for n, r in zip(counts, ranges, strict=True)]
             counts[int(np.argmax(dense))] -= 1

@@ -29,11 +29,11 @@ _GIVE = (1e-4, 0.1)
 from a reversal of friction between two samples."""
 _LOSS = (1e-2, 3.0)
 """Losses at the highest load, as shares of that load."""
-_GAP = (1e-3, 0.06)
+_GAP = (1e-3, 0.05)
 """Play, as shares of the travel."""
-_DRIVE = (0.05, 0.5)
+_DRIVE = (0.15, 0.85)
 """Inertia of a drive, as shares of that of its axis."""
-_GAPS, _DRIVES = 15, 4
+_GAPS, _DRIVES = 14, 4
 """Grid values of play and of the inertia of a drive. In a gap half too wide, impacts come too late
 to fit."""
 _LIGHTEST = 6.0
@@ -66,7 +66,7 @@ class SearchRange:
             reciprocals of the distance from there, negative on the lower side.
         largest_distance: largest such distance.
         largest_spacing: largest distance of two grid values, which are then evenly spaced.
-        least_count: smallest number of grid values.
+        count: number of grid values, if it is fixed.
     """
 
     low: float
@@ -75,13 +75,12 @@ class SearchRange:
     travel_middle: float | None = None
     largest_distance: float = np.inf
     largest_spacing: float = np.inf
-    least_count: int = 1
+    count: int = 0
 
     @property
     def grid_size(self) -> int:
         """Smallest number of values of a grid."""
-        count = 1 + int(np.ceil((self.high - self.low) / self.largest_spacing))
-        return max(self.least_count, count)
+        return 1 + int(np.ceil((self.high - self.low) / self.largest_spacing))
 
     @property
     def extent(self) -> float:
@@ -184,8 +183,8 @@ class MachineScale:
             travel = max(float(self.highest[i] - self.lowest[i]), 1e-300)
             return SearchRange(low, high, True, largest_spacing=2.0 * np.pi * _WAVES_APART / travel)
         is_length = item.axes and parameter.unit == self.coordinates[item.axes[0]][0]
-        least = 1 if item.effect.ahead is None else _GAPS if is_length else _DRIVES
-        return SearchRange(low, high, True, least_count=least)
+        count = 0 if not item.effect.has_play else _GAPS if is_length else _DRIVES
+        return SearchRange(low, high, True, count=count)
 
     def _sizes(self, item: BoundEffect, parameter: Parameter) -> dict[str, tuple[float, float]]:
         """Return the range of sizes at the target of an effect, by unit."""
@@ -207,7 +206,7 @@ class MachineScale:
         lightness = 1.0 / max(inertia, 1e-300)
         highest = 2.0 * np.pi * _RESONANCE * self.band_hz[i]
         per_force = force.replace(".", "/")
-        length = _GAP if item.effect.ahead else _TRAVEL
+        length = _GAP if item.effect.has_play else _TRAVEL
         return found | {
             unit: (length[0] * travel, length[1] * travel),
             "kg.m2" if unit == "rad" else "kg": (_DRIVE[0] * inertia, _DRIVE[1] * inertia),

@@ -154,7 +154,8 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
             known = _apply_lagrange(d, energies)
             d.inertia = [row[i] for i, row in enumerate(known.mass)]
             d.bias = [h - t for h, t in zip(known.bias, torque, strict=True)]
-            d.torque = [e - t for e, t in zip(other, torque, strict=True)]
+            if not d.changes:  # an effect with play knows of no other on its axis
+                d.torque = [e - t for e, t in zip(other, torque, strict=True)]
         symbols = d.effect_symbols(
             item, prompt_force if by_axis is offset else delivered_force, inputs.side
         )
@@ -194,6 +195,7 @@ def _move_bias(d: Vocabulary, item: BoundEffect, ahead: Ahead, symbols: Symbols)
     true = {d.q[i]: d.q[i] + position, d.qd[i]: d.qd[i] + rate}
     moved = [h.subs(true, simultaneous=True) for h in d.bias]
     symbols["axis_bias"] = moved[i]
+    d.with_definitions(item, symbols)
     share = d.build(ahead.share, symbols, "ahead.share", item)
     return [share * (h - m) for h, m in zip(d.bias, moved, strict=True)]
 

@@ -382,7 +382,7 @@ class Device(DeclaredFile):
 
     def has_dry_friction(self, axis: str) -> bool:
         """Whether the device adds dry friction of its own to ``axis``, beside the base term."""
-        return axis in self.torque and expression.calls([self.torque[axis]], "sgn")
+        return axis in self.torque and bool(expression.names_within([self.torque[axis]], "sgn"))
 
     def has_weight(self, axis: str) -> bool:
         """Whether the device's potential energy depends on the position of ``axis``."""

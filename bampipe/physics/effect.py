@@ -134,6 +134,8 @@ class Effect(DeclaredFile):
     source: Text = Field(description="Literature, with year")
     parameters: dict[Name, EffectParameter] = Field(min_length=1)
     """Its parameters, by name; each for all axes, or by kind of axis"""
+    definitions: dict[Name, Expression] = Field(default={})
+    """Expressions that those of the effect, and later definitions, may use by name"""
     states: Annotated[tuple[State, ...], ByName(Name)] = Field(
         default=(), description="Internal states, by name, if it has memory"
     )
@@ -162,6 +164,7 @@ class Effect(DeclaredFile):
             value = self.declaration.get(key, {})
             by_place = value if isinstance(value, Mapping) else {"": value}
             pairs += [(f"{key} of {at}" if at else key, text) for at, text in by_place.items()]
+        pairs += self.declaration.get("definitions", {}).items()
         for name, state in self.declaration.get("states", {}).items():
             pairs.append((f"d {name}/dt", state["rate"]))
             pairs += [(f"{name} at the start", state[k]) for k in ("initial",) if k in state]
@@ -171,7 +174,7 @@ class Effect(DeclaredFile):
     def is_dry_friction(self) -> bool:
         """Whether it is a torque on axes that changes sign with their motion."""
         on_axes = self.kind == "torque" and self.scope in ("axis", "axis_pair")
-        return on_axes and expression.calls(self.expressions.values(), "sgn")
+        return on_axes and bool(expression.names_within(self.expressions.values(), "sgn"))
 
     @property
     def acting_link(self) -> Link | None:
@@ -201,9 +204,10 @@ class Effect(DeclaredFile):
             yield InputError("'link' does not apply to kind 'energy'")
         if not self.expressions:
             yield InputError(f"an effect of kind {self.kind!r} needs {' or '.join(main)}")
-        for state in self.states:
-            if state.name in self.parameters:
-                yield InputError("a parameter has this name already", where=f"states.{state.name}")
+        names = [f"states.{state.name}" for state in self.states]
+        for where in (*names, *(f"definitions.{name}" for name in self.definitions)):
+            if where.partition(".")[2] in self.parameters:
+                yield InputError("a parameter has this name already", where=where)
 
     def targets(self, device: Device) -> tuple[str, ...]:
         """Names after the colon that make sense for ``device``; ``("",)`` for a device effect."""
@@ -246,7 +250,7 @@ class Effect(DeclaredFile):
     @cached_property
     def names(self) -> set[str]:
         """Every name that its expressions use."""
-        trees = [*self.expressions.values()]
+        trees = [*self.expressions.values(), *self.definitions.values()]
         trees += [tree for state in self.states for tree in (state.rate, state.initial)]
         trees += [self.ahead.share, self.ahead.position, self.ahead.rate] if self.ahead else []
         return set().union(*map(expression.names, trees))
@@ -277,6 +281,12 @@ class Effect(DeclaredFile):
         return self.ahead is not None or bool(self.names & of_axis)
 
     @property
+    def has_play(self) -> bool:
+        """Whether its torque is a change of momentum of its states: impacts between samples."""
+        within = expression.names_within(self.expressions.values(), "ddt")
+        return any(state.name in within for state in self.states)
+
+    @property
     def pulls(self) -> bool:
         """Whether it is a torque by the position of its axis alone, as of a spring or a cable."""
         if self.kind != "torque" or self.scope != "axis" or self.acting_link or self.states:
@@ -298,6 +308,7 @@ class Effect(DeclaredFile):
         known |= {f"{term}_{axis}" for term in terms for axis in axes} | {"t", *axes}
         known |= {f"support_{axis}" for axis in device.torque}
         known |= {*device.definitions, *device.constants, *device.channels, *self.parameters}
+        known |= {*self.definitions}
         known |= {entry.name for entry in (*device.parameters, *self.states)}
         return keys <= places and self.names <= known | {*device.brakes.values()}
 

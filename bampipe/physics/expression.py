@@ -139,10 +139,11 @@ def names(tree: ast.AST) -> set[str]:
     return {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and id(n) not in functions}
 
 
-def calls(trees: Iterable[ast.expr], name: str) -> bool:
-    """Whether an expression calls the function ``name``."""
-    functions = (n.func for t in trees for n in ast.walk(t) if isinstance(n, ast.Call))
-    return any(isinstance(function, ast.Name) and function.id == name for function in functions)
+def names_within(trees: Iterable[ast.expr], function: str) -> set[str]:
+    """Names in the arguments of every call of ``function``."""
+    calls = (n for t in trees for n in ast.walk(t) if isinstance(n, ast.Call))
+    arguments = (c.args for c in calls if isinstance(c.func, ast.Name) and c.func.id == function)
+    return {name for some in arguments for argument in some for name in names(argument)}
 
 
 def reached_names(trees: Iterable[ast.expr], definitions: Mapping[str, ast.expr]) -> set[str]:

@@ -9,16 +9,7 @@ import sympy as sp
 
 from bampipe import generated_code
 from bampipe.model_functions import ROWS
-from bampipe.physics.codegen import (
-    array_source,
-    bodies_along_motion,
-    bodies_at_state,
-    dynamics_source,
-    residual_source,
-    rows_sources,
-    scalar_sources,
-    slopes_source,
-)
+from bampipe.physics import codegen
 from bampipe.physics.derivation import derive
 from bampipe.physics.equations import Equations, contribution
 from bampipe.physics.memory_code import group_states, memory_source
@@ -57,7 +48,7 @@ def effects_code(model: Model) -> Generation:
         "delays": equations.delays,
         "braked": any(brakes & e.free_symbols for e in (*added, *equations.rates)),
     }
-    sources = {"columns": array_source(equations, added)}
+    sources = {"columns": codegen.array_source(equations, added)}
     uncommanded, groups = {*forces, channels.get("t")}, []
     for k, places in enumerate(group_states(equations)):
         sources[f"memory{k}"], uses = memory_source(equations, places)
@@ -70,9 +61,9 @@ def effects_code(model: Model) -> Generation:
 def whole_code(model: Model) -> Generation:
     """Which slopes are the same everywhere, and the source of the whole mechanism's functions."""
     equations = _derive_once(model)
-    slopes, places = slopes_source(equations)
-    names, along = bodies_along_motion(equations)
-    known, here = bodies_at_state(equations)
+    slopes, places = codegen.slopes_source(equations)
+    names, along = codegen.bodies_along_motion(equations)
+    known, here = codegen.bodies_at_state(equations)
     lasting = enumerate(equations.dependence.lasting)
     facts = {
         "slopes": places,
@@ -82,26 +73,26 @@ def whole_code(model: Model) -> Generation:
     }
     sources = {
         "slopes": slopes,
-        "dynamics": dynamics_source(equations),
-        **rows_sources(equations, ROWS),
+        "dynamics": codegen.dynamics_source(equations),
+        **codegen.rows_sources(equations, ROWS),
     }
-    sources["residual"], title = residual_source(equations, names), ""
+    sources["residual"], title = codegen.residual_source(equations, names), ""
     if names:
         sources["bodies"], sources["compiled_bodies"] = along, here
         title = generated_code.module_title("compiled_bodies", here)
-    return facts, sources | scalar_sources(equations, known, title)
+    return facts, sources | codegen.scalar_sources(equations, known, title)
 
 
 def moved_first(model: Model, e: Equations, forces: list[Any]) -> list[list[int]]:
     """Return, by axis, the places in a state of the position and rate that a force acts on first.
 
-    They are those of the axis, or the first states of a part that moves the axis through play.
+    They are those of the axis, or of an effect's first state, a part that moves it through play.
     """
     n = len(e.q)
     found = [[i, n + i] for i in range(n)]
     axes = [coordinate.name for coordinate in model.device.coordinates]
     for item in model.effects:
-        for state in item.effect.states:
+        for state in item.effect.states[:1]:
             place = e.z_names.index(f"{item.prefix}.{state.name}")
             if (rate := e.rates[place]) in e.z and e.rates[e.z.index(rate)].has(*forces):
                 axis = axes.index(item.axes[0])

@@ -28,7 +28,7 @@ def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
         effect = item.effect
         last = "dry" in effect.names or effect.uses_weight or effect.uses_inertia
         last |= effect.uses_support
-        return (_ORDER[link] if link else len(_ORDER), last, effect.ahead is not None, item.name)
+        return (_ORDER[link] if link else len(_ORDER), last, effect.has_play, item.name)
 
     return sorted(effects, key=order_key)
 

@@ -291,7 +291,7 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
-            symbols |= dict.fromkeys((*terms, "dry", "axis_bias", "axis_torque"), torque)
+            symbols |= dict.fromkeys((*terms, "dry", "axis_bias", "axis_torque", "support"), torque)
             symbols |= {"qdd": unit / second**2, "axis_inertia": torque * second**2 / unit}
             symbols["viscous"] = torque * second / unit
             if axis in device.side_load:
@@ -330,6 +330,8 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
     symbols = _effect_symbols(item, device, check)
     for name, unit in state_units(item, device).items():
         symbols[name] = check.unit(unit, f"states.{name}.unit")
+    for name, tree in effect.definitions.items():
+        symbols[name] = check.expression(tree, symbols, f"definitions.{name}", None)
     force = symbols[device.forces[0]] if device.forces else None
     wanted: dict[str, Callable[[str], Found]] = {
         "torque": {axis: torque for axis, _, torque in _axes(device)}.get,

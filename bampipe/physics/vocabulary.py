@@ -193,7 +193,7 @@ class Vocabulary:
         if item.effect.scope == "axis":
             i, a = self.axes.index(item.target), item.target
             symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
-            own = ("applied", "load", "viscous", "coulomb", "weight", "pull")
+            own = ("applied", "load", "viscous", "coulomb", "weight", "pull", "support")
             symbols |= {n: symbols[f"{n}_{a}"] for n in own}
             symbols |= {"dry": self.dry[i], "qdd": self.qdd[i]}
             symbols |= {"axis_inertia": self.inertia[i], "axis_bias": self.bias[i]}
@@ -214,4 +214,10 @@ class Vocabulary:
         symbols |= {s.name: self.z[item.prefix, s.name] for s in item.effect.states}
         for p in item.parameters:
             symbols[p.name.removeprefix(f"{item.prefix}.")] = self.p[p.name]
+        return self.with_definitions(item, symbols)
+
+    def with_definitions(self, item: BoundEffect, symbols: Symbols) -> Symbols:
+        """``symbols`` and the definitions of ``item`` in their terms."""
+        for name, tree in item.effect.definitions.items():
+            symbols[name] = self.build(tree, symbols, f"definitions.{name}", item)
         return symbols

@@ -55,7 +55,7 @@ class Config(Criteria):
         seed: seed of the noise in the replicates.
         trust_setup: whether to diagnose in spite of a mistake in the set-up.
         without: effects that are not weighed, such as one that was added in vain.
-        also: effects that are weighed on request only, such as loose_load:joint.
+        also: effects that are weighed on request only, such as loose_link:elbow.
     """
 
     model: str = "base"

@@ -78,7 +78,7 @@ def problem_of(
     lower = [parameters[i].lower for i in free]
     upper = [parameters[i].upper for i in free]
     # The instant of an impact is strongly nonlinear in its parameters: use a wide secant.
-    contact = {q.name for e in system.model.effects if e.effect.ahead for q in e.parameters}
+    contact = {q.name for e in system.model.effects if e.effect.has_play for q in e.parameters}
     step = [
         1.0
         if system.linear[i]

@@ -52,7 +52,7 @@ def slopes_by_force(
     (K, n_q, n_forces, m), at the thinned samples.
     """
     model = system.model
-    passing = [e for e in model.effects if e.effect.ahead is None]
+    passing = [e for e in model.effects if not e.effect.has_play]
     if len(passing) < len(model.effects):
         # A contact only delays the force that a gap holds back, so it takes nothing away.
         names = [q.name for q in system.parameters]

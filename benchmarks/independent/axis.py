@@ -61,7 +61,8 @@ def _draw_specimen(
     specimen.truth |= mechanism
     specimen.hide(effects, LAWS, MOTOR, rng)
     # What hangs behind a coupling is not in the mass that moves with the encoder.
-    specimen.truth["mass"] = mechanism["mass"] - float(specimen.machine["load_inertia"])
+    if not specimen.machine["gap"]:
+        specimen.truth["mass"] = mechanism["mass"] - float(specimen.machine["load_inertia"])
     return specimen
 
 

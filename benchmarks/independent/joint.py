@@ -114,8 +114,9 @@ def _draw_specimen(
     specimen = Specimen("joint", mechanism | control, friction, play=0.024)
     specimen.truth |= mechanism
     specimen.hide(effects, LAWS, MOTOR, rng)
-    # What lies behind play is not in the inertia that moves with the encoder.
-    specimen.truth["inertia"] = mechanism["inertia"] - float(specimen.machine["load_inertia"])
+    # What hangs behind a coupling is not in the inertia that moves with the encoder.
+    if not specimen.machine["gap"]:
+        specimen.truth["inertia"] = mechanism["inertia"] - float(specimen.machine["load_inertia"])
     return specimen
 
 

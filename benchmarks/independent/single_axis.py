@@ -173,10 +173,10 @@ class Specimen:
                 if m["driven"]:  # with gains for a stiff drive, the loop would hammer in the gap
                     for gain in ("velocity_gain", "position_gain"):
                         m[gain] *= GENTLE
-                names = {"gap": "gap", "load_inertia": "inertia"}
-                names |= {"load_frequency": "frequency", "load_damping": "damping"}
-                found = {f"{full.replace(':', '.')}.{n}": float(m[k]) for k, n in names.items()}
-                self.truth |= found
+                found = {n: m[f"load_{n}"] for n in ("frequency", "damping")}
+                driven = share if m["driven"] else 1.0 - share
+                found |= {"gap": m["gap"], "drive_inertia": driven * m["inertia"]}
+                self.truth |= {f"{full.replace(':', '.')}.{n}": float(x) for n, x in found.items()}
             else:
                 raise ValueError(f"the machine has no effect {full!r}")
 

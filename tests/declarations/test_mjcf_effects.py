@@ -150,10 +150,10 @@ def test_several_effects_and_shared_motors_act_together(tmp_path: Path) -> None:
 
 def test_play_before_a_load_is_nearly_so_and_said_to_be(tmp_path: Path, bare: np.ndarray) -> None:
     loose = {"inertia": 0.15, "gap": 0.05, "frequency": 60.0, "damping": 0.3, "hang": 0.01}
-    case = Case(tmp_path, {"loose_load:elbow_2": loose})
+    case = Case(tmp_path, {"loose_link:elbow_2": loose})
     ours = case.ours(waves())
     assert far(ours, case.theirs(waves())) < min(0.1, 0.3 * far(ours, bare))
-    assert "not in it: of loose_load:elbow_2 its weight, and that nothing damps it" in case.text
+    assert "not in it: of loose_link:elbow_2 its weight, and that nothing damps it" in case.text
 
 
 def test_what_mujoco_has_no_place_for_is_listed(tmp_path: Path) -> None:

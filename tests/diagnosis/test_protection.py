@@ -166,7 +166,7 @@ def test_twins_are_undecided_and_their_probabilities_sum_to_one(record):
     [
         pytest.param("bam", "detent:yaw", set(), marks=pytest.mark.long),
         ("axis", "rough_patch:carriage", {"position_dependent_friction:carriage"}),
-        ("joint", "loose_load:joint", set()),
+        ("joint", "detent:joint", set()),
     ],
 )
 def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, effect, doubt):

@@ -26,8 +26,8 @@ def range_of(effect, parameter, scale=AXIS):
         ("drive_sag:carriage", "sag", 1e-4, 0.03),
         ("actuator_delay", "delay", 2e-4, 0.08),
         ("thermal_damping:carriage", "time_constant", 1.0, 60.0),
-        ("loose_drive:carriage", "gap", 25e-6, 0.0625),
-        ("loose_drive:carriage", "lightness", 0.02, 0.12),
+        ("loose_drive:carriage", "gap", 25e-5, 0.0125),
+        ("loose_drive:carriage", "drive_inertia", 7.5, 42.5),
     ],
 )
 def test_a_range_follows_travel_speed_load_and_sampling(effect, parameter, low, high):

@@ -155,14 +155,14 @@ def test_absent_at_zero_strength_and_there_at_typical(case):
 
 PLACES = ("", "yaw", "x", "xy", "yaw-extension")
 SECOND = ("extension", "z")
-# Impacts across play need forces that go with the motion: backlash is found on simulated sessions,
-# and `test_machine_effects` has the flight of a loose load in closed form.
+# Impacts across play need forces that go with the motion: play is found on simulated sessions, and
+# `test_machine_effects` has the flight of what is loose in closed form.
 RECOVERED = [
     pytest.param(c, marks=[pytest.mark.long] * (place in SECOND))
     for c, place in ((c, c.partition(":")[2]) for c in CASES if not c.startswith("backlash"))
     if place in (*PLACES, *SECOND)
 ]
-RECOVERED += [case for case in ELSEWHERE if "loose_load" not in case]
+RECOVERED += [case for case in ELSEWHERE if "loose" not in case]
 
 
 @pytest.mark.parametrize("case", RECOVERED)

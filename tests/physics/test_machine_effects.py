@@ -208,33 +208,30 @@ def test_a_flexible_load_is_rigid_below_its_frequency_and_left_behind_above_it()
         assert mass == pytest.approx(70.0 + 25.0 * ratio.real, rel=2e-3)
 
 
-GAP, BEHIND, PUSH = 2e-3, 25.0, 50.0
+GAP, MASS, DRIVE, PUSH = 2e-3, 70.0, 25.0, 50.0
 
 
 @pytest.mark.parametrize("effect", ["loose_load", "loose_drive"])
 def test_what_is_loose_flies_free_for_as_long_as_it_crosses_half_the_gap(effect):
     system = compile_model(Model(registry.device("slider"), [f"{effect}:carriage"]))
-    p = dict.fromkeys(("viscous.carriage", "coulomb.carriage", "offset"), 0.0) | {"mass": 70.0}
-    own = {"inertia": BEHIND, "gap": GAP, "frequency": 120.0, "damping": 1.0}
-    p |= {f"{effect}.carriage.{name}": value for name, value in own.items()}
-    if effect == "loose_drive":
-        p["loose_drive.carriage.lightness"] = 1.0 / BEHIND
-    values = with_values(system, p)
+    p = dict.fromkeys(("viscous.carriage", "coulomb.carriage", "offset"), 0.0) | {"mass": MASS}
+    own = {"share": 1.0, "gap": GAP, "drive_inertia": DRIVE, "damping": 1.0}
+    values = with_values(system, p | {f"{effect}.carriage.{n}": v for n, v in own.items()})
     t = np.arange(0.0, 1.0, 1e-3)[:, None]
-    # The load is left behind by what the motor moves; or the motor leaves what is held.
-    acceleration = PUSH / BEHIND
-    moved = acceleration if effect == "loose_load" else 0.0
+    # The motor leaves its load behind; or what is held, which its force reaches when it arrives.
+    moved = PUSH / DRIVE if effect == "loose_load" else 0.0
     q, qd, qdd = 0.5 * moved * t**2, moved * t, moved + 0.0 * t
     u = np.zeros((t.size, len(system.inputs)))
     u[:, system.inputs.index("force_motor")] = PUSH
     z = system.memory(q, qd, qdd, u, values, t[:, 0])
-    carried = PUSH - system.residual(q, qd, qdd, z, u, values)[:, 0] - 70.0 * moved
-    if effect == "loose_drive":
-        carried = system.residual(q, qd, qdd, z, u, values)[:, 0]
-    flies = t[:, 0] < np.sqrt(GAP / acceleration)
-    np.testing.assert_allclose(carried[flies], 0.0, atol=1e-9)
-    assert carried[np.flatnonzero(~flies)[1]] > 0.0
-    np.testing.assert_allclose(carried[-1], PUSH, rtol=1e-6)
+    left = system.residual(q, qd, qdd, z, u, values)[:, 0]
+    arrives = np.sqrt(GAP / (PUSH / DRIVE))
+    # Positions are linear between samples, which the simulated side forgets within 20 ms.
+    flies = (t[:, 0] > 0.02) & (t[:, 0] < arrives - 1e-3)
+    assert flies.sum() > 9
+    np.testing.assert_allclose(left[flies], 0.0, atol=1e-3)
+    assert abs(left[round(1e3 * arrives) + 1]) > PUSH
+    np.testing.assert_allclose(left[-1], PUSH - MASS * moved, rtol=1e-2)
 
 
 def test_an_arm_leads_the_motor_that_moves_the_axis_through_play():
