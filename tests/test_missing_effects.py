@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from missing_effects import make, score
+from missing_effects import greedy, make, score
 from missing_effects.recipes import TABLE, Recipe, draw_recipes, read_recipes
 
 FOLDER = TABLE.parent
@@ -104,3 +104,8 @@ def test_stating_what_one_believes_scores_best():
 def test_an_entry_that_cannot_be_scored_is_refused_by_line(lines, fault: str, tmp_path: Path):
     with pytest.raises(SystemExit, match=fault):
         _scored(lines, tmp_path)
+
+
+def test_the_baseline_is_surer_of_an_effect_the_more_it_lowers_the_error():
+    line = {"id": "test_001", "steps": [["a", 2.0], ["b", 0.1]], "seconds": 1.0}
+    assert greedy.answer(line, [0.0, 1.0])["effects"] == {"a": 0.6667, "b": 0.0909}

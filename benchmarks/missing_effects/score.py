@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +35,16 @@ KINDS = (
 """Effects that write the same cause in other mathematics: friction that builds up over a distance,
 and a drive that is late."""
 LOG_SCORE = "logarithmic score of effects, nats a session"
+DETAILS = (
+    "the same, or another of the same kind hidden",
+    "clean sessions left undecided",
+    "Brier score of effects, a session",
+    "Brier score of the unknown, a session",
+    "logarithmic score of the unknown, nats a session",
+    "error over floor, median and 95 %",
+    "sessions",
+)
+"""Rows that a summary leaves out."""
 ENTRIES = Path(__file__).parents[1] / "results/missing_effects"
 
 
@@ -184,11 +194,11 @@ def _quantiles(values: Sequence[float], at: tuple[int, int], digits: int, unit: 
     return f"{low:.{digits}f}, {high:.{digits}f}{unit}"
 
 
-def write_table(columns: Mapping[str, Sequence[Pair]]) -> str:
-    """Scores of entries side by side, as Markdown."""
+def write_table(columns: Mapping[str, Sequence[Pair]], without: Collection[str] = ()) -> str:
+    """Scores of entries side by side, as Markdown; ``without`` these rows."""
     scored = {title: score(pairs) for title, pairs in columns.items()}
     lines = ["| | " + " | ".join(scored) + " |", "|-|" + "-|" * len(scored)]
-    for row in next(iter(scored.values())):
+    for row in (row for row in next(iter(scored.values())) if row not in without):
         lines.append(f"| {row} | " + " | ".join(s[row] for s in scored.values()) + " |")
     return "\n".join(lines)
 
@@ -223,18 +233,18 @@ def common(entries: Mapping[str, Sequence[Pair]]) -> dict[str, list[Pair]]:
     return {name: [(r, a) for r, a in ps if r.id in ids] for name, ps in entries.items()}
 
 
-def write_summary(folder: Path = ENTRIES) -> str:
+def write_summary(folder: Path = ENTRIES, without: Collection[str] = DETAILS) -> str:
     """How many sessions each stored entry answers, and all on those that all answer."""
     entries = read_entries(folder)
     answered = ", ".join(f"{len(pairs)} by {name}" for name, pairs in entries.items())
     head = f"Answered, of the {HIDDEN + CLEAN} sessions of the test part: {answered}."
     head += " On those that all entries answer:"
-    return f"{head}\n\n{write_table(common(entries))}"
+    return f"{head}\n\n{write_table(common(entries), without)}"
 
 
 def write_results(folder: Path = ENTRIES) -> str:
     """`write_summary`, then each stored entry on all that it answers."""
-    parts = [write_summary(folder)]
+    parts = [write_summary(folder, ())]
     for name, pairs in read_entries(folder).items():
         parts += [f"All that {name} answers:", write_table({name: pairs})]
         parts += [write_groups(pairs, "machine", _machine), write_groups(pairs, "day", _day)]
