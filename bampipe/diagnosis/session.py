@@ -44,7 +44,7 @@ from bampipe.workers import process_pool
 
 Seed = tuple[int, ...]
 
-_MOST_STEPS = 8
+_MOST_STEPS = 24
 _STEP_LENGTHS = (1.0, 0.3, 0.1, 0.03)
 _CONVERGED = 0.2
 """A fit ends when a step promises a smaller fall of the negative log likelihood, nats."""

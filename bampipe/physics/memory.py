@@ -10,7 +10,7 @@ from bampipe.arrays import Array, Flags
 
 STEP_ERROR = 1e-6
 """Largest estimated error of a step of coupled states, of the largest value of a state."""
-LEAST_STEP = 2.0**-16
+LEAST_STEP = 2.0**-12
 """Shortest step of coupled states, of the time from one sample to the next."""
 ACCURATE = 0.25
 """Largest product of a step, from one sample to the next, and the rate of an uncoupled state: the

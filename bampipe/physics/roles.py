@@ -23,7 +23,7 @@ def find_compensation(d: Vocabulary, potential: Any, inputs: ActingInputs) -> li
         t.free_symbols & set(d.q) and potential.has(q) for t, q in zip(torque, d.q, strict=True)
     ]
     results = [s if kept else sp.S.Zero for s, kept in zip(d.support, balanced, strict=True)]
-    for item in (e for e in d.model.effects if e.effect.uses_support):
+    for item in (e for e in d.model.effects if e.effect.uses_support and not e.effect.has_play):
         for key, tree in item.effect.expressions.items():
             place = d.axes.index(item.target_of(key))
             if balanced[place]:
