@@ -154,7 +154,7 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
             known = _apply_lagrange(d, energies)
             d.inertia = [row[i] for i, row in enumerate(known.mass)]
             d.bias = [h - t for h, t in zip(known.bias, torque, strict=True)]
-            if not d.changes:  # an effect with play knows of no other on its axis
+            if not d.changes:  # an effect with play knows of no other
                 d.torque = [e - t for e, t in zip(other, torque, strict=True)]
         symbols = d.effect_symbols(
             item, prompt_force if by_axis is offset else delivered_force, inputs.side

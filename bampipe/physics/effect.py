@@ -171,10 +171,14 @@ class Effect(DeclaredFile):
         return tuple(f"{left} = {' '.join(str(right).split())}" for left, right in pairs)
 
     @property
+    def _formulas(self) -> tuple[ast.expr, ...]:
+        return (*self.expressions.values(), *self.definitions.values())
+
+    @property
     def is_dry_friction(self) -> bool:
         """Whether it is a torque on axes that changes sign with their motion."""
         on_axes = self.kind == "torque" and self.scope in ("axis", "axis_pair")
-        return on_axes and bool(expression.names_within(self.expressions.values(), "sgn"))
+        return on_axes and bool(expression.names_within(self._formulas, "sgn"))
 
     @property
     def acting_link(self) -> Link | None:
@@ -250,8 +254,7 @@ class Effect(DeclaredFile):
     @cached_property
     def names(self) -> set[str]:
         """Every name that its expressions use."""
-        trees = [*self.expressions.values(), *self.definitions.values()]
-        trees += [tree for state in self.states for tree in (state.rate, state.initial)]
+        trees = [*self._formulas, *(t for s in self.states for t in (s.rate, s.initial))]
         trees += [self.ahead.share, self.ahead.position, self.ahead.rate] if self.ahead else []
         return set().union(*map(expression.names, trees))
 
@@ -283,7 +286,7 @@ class Effect(DeclaredFile):
     @property
     def has_play(self) -> bool:
         """Whether its torque is a change of momentum of its states: impacts between samples."""
-        within = expression.names_within(self.expressions.values(), "ddt")
+        within = expression.names_within(self._formulas, "ddt")
         return any(state.name in within for state in self.states)
 
     @property
@@ -291,7 +294,7 @@ class Effect(DeclaredFile):
         """Whether it is a torque by the position of its axis alone, as of a spring or a cable."""
         if self.kind != "torque" or self.scope != "axis" or self.acting_link or self.states:
             return False
-        return self.names - set(self.parameters) == {"q"}
+        return self.names - {*self.parameters, *self.definitions} == {"q"}
 
     def _lacks_kind(self, kind: str) -> bool:
         """Whether a parameter has no entry for this kind of axis."""
@@ -308,8 +311,7 @@ class Effect(DeclaredFile):
         known |= {f"{term}_{axis}" for term in terms for axis in axes} | {"t", *axes}
         known |= {f"support_{axis}" for axis in device.torque}
         known |= {*device.definitions, *device.constants, *device.channels, *self.parameters}
-        known |= {*self.definitions}
-        known |= {entry.name for entry in (*device.parameters, *self.states)}
+        known |= {*self.definitions} | {entry.name for entry in (*device.parameters, *self.states)}
         return keys <= places and self.names <= known | {*device.brakes.values()}
 
 

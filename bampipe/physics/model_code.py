@@ -96,7 +96,7 @@ def moved_first(model: Model, e: Equations, forces: list[Any]) -> list[list[int]
             place = e.z_names.index(f"{item.prefix}.{state.name}")
             if (rate := e.rates[place]) in e.z and e.rates[e.z.index(rate)].has(*forces):
                 axis = axes.index(item.axes[0])
-                if found[axis][0] == axis and e.other_now[axis].has(e.z[place]):
+                if e.other_now[axis].has(e.z[place]):
                     found[axis] = [2 * n + place, 2 * n + e.z.index(rate)]
     return found
 

@@ -286,12 +286,12 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict
     second = _UNITS["s"]
     symbols = _device_symbols(device, _Findings())
     for axis, unit, torque in _axes(device):
-        terms = ("applied", "load", "coulomb", "weight", "pull")
-        symbols |= dict.fromkeys((f"{term}_{axis}" for term in (*terms, "support")), torque)
+        terms = ("applied", "load", "coulomb", "weight", "pull", "support")
+        symbols |= dict.fromkeys((f"{term}_{axis}" for term in terms), torque)
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
-            symbols |= dict.fromkeys((*terms, "dry", "axis_bias", "axis_torque", "support"), torque)
+            symbols |= dict.fromkeys((*terms, "dry", "axis_bias", "axis_torque"), torque)
             symbols |= {"qdd": unit / second**2, "axis_inertia": torque * second**2 / unit}
             symbols["viscous"] = torque * second / unit
             if axis in device.side_load:

@@ -246,11 +246,11 @@ def put_in_order(table: TrialTable) -> None:
     for start, stop in zip(*find_runs(mixed), strict=True):
         rows = slice(start, stop + 1)
         place = start + np.argsort(t[rows], kind="stable")
-        travels = [np.abs(np.diff(positions[:, x])).sum() for x in (np.r_[rows], place)]
+        before, after = (np.abs(np.diff(positions[:, x])).sum() for x in (np.r_[rows], place))
         falls = start + np.flatnonzero(np.diff(t[rows]) < 0.0)
         # Two recordings one after the other fall once, and their stamps are the same.
         late_rows = len(falls) > 1 and np.mean(np.diff(t[place]) == 0.0) < _UNLIKELY_TWICE
-        if late_rows and travels[1] < _SMOOTHER * travels[0]:
+        if late_rows and after < _SMOOTHER * before:
             order[rows] = place
             late += int(np.sum(place != np.arange(start, stop + 1)))
         elif len(falls) == 1:

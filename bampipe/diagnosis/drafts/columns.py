@@ -251,10 +251,8 @@ class FormDictionary:
     @cached_property
     def spans(self) -> dict[str, forms.Span]:
         """The range of each quantity that varies."""
-        words = [
-            c.words
-            for c in forms.list_quantities(self.linearisation.system.model.device, self.axis)
-        ]
+        device = self.linearisation.system.model.device
+        words = [c.words for c in forms.list_quantities(device, self.axis)]
         ends = {n: np.quantile(np.concatenate(self._signals[n]), _RANGE) for n in words}
         return {n: forms.Span(float(a), float(b)) for n, (a, b) in ends.items() if b - a > 1e-9}
 
