@@ -45,9 +45,12 @@ from bampipe.workers import process_pool
 Seed = tuple[int, ...]
 
 _MOST_STEPS = 24
-_STEP_LENGTHS = (1.0, 0.3, 0.1, 0.03)
+_MOST_TRIED, _LEAST_DAMPING = 5, 0.01
+"""Number of dampings that are tried for a step, each ten times the last, and the first of them."""
 _CONVERGED = 0.2
 """A fit ends when a step promises a smaller fall of the negative log likelihood, nats."""
+_LEAST_FALL = 0.02
+"""Smallest fall of it that a step must bring for another to be taken, nats."""
 _STOPPING_WIDTH = 0.125
 """Factor on the sign width of the replicate that stops; a 32nd gives the same residual."""
 _SEED = 7
@@ -260,7 +263,8 @@ class Session:
         """Take Gauss-Newton steps to the most likely parameters within their bounds.
 
         A step is accepted if it lowers the cost with refitted nuisance parameters, since the
-        linear problem can promise far more than a step in a shape achieves.
+        linear problem can promise far more than a step in a shape achieves; else it is damped
+        (Marquardt 1963).
 
         Raises:
             ValueError: fewer samples are clear of standstill than there are parameters.
@@ -268,27 +272,32 @@ class Session:
         problem, count = pose_problem(likelihood, linearisation), len(linearisation.free)
         if sum(map(len, problem.y)) <= count:
             raise ValueError("fewer samples clear of standstill than parameters")
-        here = problem.solve_nuisance(count).cost
+        here, damping = problem.solve_nuisance(count).cost, 0.0
         for _ in range(_MOST_STEPS):
             promised = problem.solve()
             if here - promised.cost < _CONVERGED:
                 break
-            step = problem.to_parameters @ promised.base
-            for share in _STEP_LENGTHS:
+            for _ in range(_MOST_TRIED):
+                solved = problem.solve_damped(damping) if damping else promised
+                step = problem.to_parameters @ solved.base
                 p = linearisation.p.copy()
-                p[list(linearisation.free)] += share * step[:count]
+                p[list(linearisation.free)] += step[:count]
                 p = np.clip(p, *bounds_of(linearisation.system))
                 try:
                     moved = self.linearise(spec, p, linearisation)
+                    tried = pose_problem(likelihood, moved)
+                    there = tried.solve_nuisance(count).cost
                 except NotFinite:
-                    continue
-                tried = pose_problem(likelihood, moved)
-                there = tried.solve_nuisance(count).cost
+                    there = np.inf
                 if there < here:
                     break
+                damping = max(10.0 * damping, _LEAST_DAMPING)
             else:
                 break
-            linearisation, problem, here = moved, tried, there
+            fall, linearisation, problem, here = here - there, moved, tried, there
+            if fall < _LEAST_FALL:
+                break
+            damping = 0.1 * damping if damping > _LEAST_DAMPING else 0.0
         return linearisation, problem
 
     def judge(self, spec: ModelSpec, p: Array, count: int = 0) -> Fit:

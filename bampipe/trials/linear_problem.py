@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -109,6 +109,7 @@ def pose_problem(likelihood: Likelihood, linearisation: Linearisation) -> Linear
         },
         {item.name: tuple(own) for item, own in zip(effects, shapes, strict=True)},
         cost_of_known, loose, dict.fromkeys(range(len(linearisation.free), n), 0.0),
+        np.diag(1.0 / values[kept]),
     )  # fmt: skip
 
 
@@ -163,6 +164,7 @@ class LinearProblem:
         cost_of_known: negative log density of the priors if nothing changes.
         loose: (n_all, m) directions of the parameters in which nothing measured changes.
         no_delay: the change of the input delay, by index, if that is fitted: none.
+        step_precision: (P, P), the diagonal of the parameters' precision, which damps a step.
     """
 
     likelihood: Likelihood
@@ -180,6 +182,7 @@ class LinearProblem:
     cost_of_known: float = 0.0
     loose: Array | None = None
     no_delay: Mapping[int, float] = field(default_factory=dict)
+    step_precision: Array | float = 0.0
 
     @property
     def independent(self) -> Array:
@@ -275,6 +278,11 @@ class LinearProblem:
     def solve(self) -> LinearSolution:
         """The most likely change of the model's own parameters."""
         return solve_bounded(self, *self.sums())
+
+    def solve_damped(self, damping: float) -> LinearSolution:
+        """The most likely change by a damped step (Marquardt 1963)."""
+        held = self.known_precision + damping * self.step_precision
+        return replace(self, known_precision=held).solve()
 
     def log_likelihood(self) -> float:
         """Log likelihood of the samples at the solution, nats, up to a constant free of weights."""
