@@ -12,12 +12,7 @@ from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.filter_uncertainty import choose_block, sandwich_covariance
 from bampipe.estimate.square_root import FilterSettings
-from bampipe.estimate.unscented import (
-    FilterFailure,
-    Trial,
-    constrain,
-    filter_trials,
-)
+from bampipe.estimate.unscented import FilterFailure, Trial, constrain, filter_trials
 from bampipe.identification.estimates import Estimate, input_timing
 from bampipe.identification.filter_run import (
     Attempt,

@@ -11,12 +11,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.arrays import Array, Flags
 from bampipe.estimate.filter_uncertainty import climb
 from bampipe.estimate.square_root import FilterSettings
-from bampipe.estimate.unscented import (
-    FilterFailure,
-    FilterModel,
-    Trial,
-    filter_trials,
-)
+from bampipe.estimate.unscented import FilterFailure, FilterModel, Trial, filter_trials
 from bampipe.physics import System
 from bampipe.results.identify import NoiseLevels
 from bampipe.schema import STRICT, NotNegative, Positive

@@ -324,9 +324,7 @@ def _axis(
         yielded=all(trial.found.yielded for trial in trials),
         cycles=tuple(
             LoopCycle.of(
-                cycle,
-                trial_id=trial.trial_id,
-                duration_s=(cycle.stop - cycle.start) / trial.rate,
+                cycle, trial_id=trial.trial_id, duration_s=(cycle.stop - cycle.start) / trial.rate
             )
             for trial, cycle in cycles
         ),
