@@ -48,14 +48,12 @@ class FilterFailure(ArithmeticError):
     """The filter lost the motion of a trial.
 
     Attributes:
-        trial: index of the trial; sample: index of the sample; reason: what happened.
+        sample: index of the sample; reason: what happened.
     """
 
-    def __init__(self, trial: int, sample: int, reason: str) -> None:
-        self.trial = trial
-        self.sample = sample
-        self.reason = reason
-        super().__init__(f"trial {trial}, sample {sample}: {reason}")
+    def __init__(self, sample: int, reason: str) -> None:
+        self.sample, self.reason = sample, reason
+        super().__init__(f"sample {sample}: {reason}")
 
 
 @dataclass(frozen=True)
@@ -224,23 +222,21 @@ def filter_trials(
     nx = model.n_states
 
     def filter_one(
-        index: int, trial: Trial, theta: Array, covariance: Array
+        trial: Trial, theta: Array, covariance: Array
     ) -> tuple[FilteredTrial, Array, Array]:
         mean = np.concatenate([trial.x, theta])
         try:
             root = join_roots(trial.x_sd, covariance)
-            filtered = run_kernel(model, settings, trial, mean, root)
-        except FilterFailure as failure:
-            raise FilterFailure(index, failure.sample, failure.reason) from None
         except ValueError as error:
-            raise FilterFailure(index, 0, _NOT_A_SPREAD) from error
+            raise FilterFailure(0, _NOT_A_SPREAD) from error
+        filtered = run_kernel(model, settings, trial, mean, root)
         return filtered, mean[nx:].copy(), (root @ root.T)[nx:, nx:]
 
     return in_sequence(filter_one, trials, np.clip(theta, *model.range), covariance)
 
 
 def in_sequence(
-    filter_one: Callable[[int, Trial, Array, Array], tuple[FilteredTrial, Array, Array]],
+    filter_one: Callable[[Trial, Array, Array], tuple[FilteredTrial, Array, Array]],
     trials: Sequence[Trial],
     theta: Array,
     covariance: Array,
@@ -248,14 +244,14 @@ def in_sequence(
     """Filter trials one after the other; each starts from the parameters of the one before.
 
     Args:
-        filter_one: filters one trial, given its number, the parameters (nt,) and their covariance
-            (nt, nt); returns the filtered trial, and parameters and covariance after it.
+        filter_one: filters one trial, given the parameters (nt,) and their covariance (nt, nt);
+            returns the filtered trial, and parameters and covariance after it.
         trials, theta, covariance: as in `filter_trials`.
     """
     theta, covariance = np.array(theta, dtype=float), np.array(covariance, dtype=float)
     found = []
-    for index, trial in enumerate(trials):
-        filtered, theta, covariance = filter_one(index, trial, theta, covariance)
+    for trial in trials:
+        filtered, theta, covariance = filter_one(trial, theta, covariance)
         found.append(filtered)
     return FilterOutcome(theta, covariance, tuple(found))
 
@@ -269,8 +265,7 @@ def run_kernel(
     are those at the first sample, and are overwritten with those at the last.
 
     Raises:
-        FilterFailure: the covariance lost positive definiteness or a number is not finite; the
-            trial has the number 0.
+        FilterFailure: the covariance lost positive definiteness or a number is not finite.
     """
     p, (observed, *sds, longest_step, stride) = _array(model.parameters), settings
     estimated = Estimated(
@@ -287,7 +282,7 @@ def run_kernel(
         *samples, mean, root,
     )  # fmt: skip
     if ended != DONE:
-        raise FilterFailure(0, sample, _REASONS[ended])
+        raise FilterFailure(sample, _REASONS[ended])
     return FilteredTrial(samples[0][:: int(stride)], *found)
 
 
