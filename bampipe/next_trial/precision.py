@@ -11,8 +11,9 @@ from bampipe.arrays import Array
 from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.least_squares import Problem, stacked_residual
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.square_root import FilterSettings
 from bampipe.identification.identifiability import find_information
-from bampipe.identification.sensor_noise import FilterChoice, Noise
+from bampipe.identification.sensor_noise import FilterChoice
 from bampipe.physics import System
 from bampipe.results.identify import IdentifyResult
 from bampipe.trials.motion import Motion
@@ -72,7 +73,7 @@ class Precision:
         band: Band,
         p: Array,
         identified: IdentifyResult,
-        noise: Noise,
+        noise: FilterSettings,
     ) -> Precision:
         """Return the precision that the trials at hand give.
 
