@@ -22,13 +22,10 @@ class InnovationTest:
     """Outcome of one test.
 
     Attributes:
-        statistic: Ljung-Box Q, or F of the regression; degrees: degrees of freedom.
-        p_value: probability of a statistic as large by chance.
+        p_value: probability of a statistic as large by chance: Ljung-Box Q, F of the regression.
         share: predictable fraction of the variance, beyond that expected by chance.
     """
 
-    statistic: float
-    degrees: int
     p_value: float
     share: float
 
@@ -67,9 +64,7 @@ def check_whiteness(records: Sequence[Array]) -> InnovationTest | None:
     correlation = products / counts / variance
     statistic = float((size + 2.0) / size * np.sum(counts * correlation**2))
     share = float(np.sum(correlation**2 - 1.0 / counts))
-    return InnovationTest(
-        statistic, _LAGS, float(stats.chi2.sf(statistic, _LAGS)), min(max(share, 0.0), 1.0)
-    )
+    return InnovationTest(float(stats.chi2.sf(statistic, _LAGS)), min(max(share, 0.0), 1.0))
 
 
 def check_independence(
@@ -109,6 +104,4 @@ def check_independence(
     rest = count - m - 1
     statistic = (explained / m) / max((total - explained) / rest, 1e-300)
     share = explained / total - m / count
-    return InnovationTest(
-        statistic, m, float(stats.f.sf(statistic, m, rest)), min(max(share, 0.0), 1.0)
-    )
+    return InnovationTest(float(stats.f.sf(statistic, m, rest)), min(max(share, 0.0), 1.0))

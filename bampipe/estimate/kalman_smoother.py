@@ -338,19 +338,6 @@ def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]
     return states[:, 0], states[:, 1] * model.rate_hz, states[:, 2] * model.rate_hz**2
 
 
-@dataclass(frozen=True)
-class Fit:
-    """A motion model chosen by maximum likelihood.
-
-    Attributes:
-        model: the chosen model.
-        log_likelihood: of all innovations, up to a constant that is the same for all models.
-    """
-
-    model: MotionModel
-    log_likelihood: float
-
-
 _FINEST = 1e-8
 """Smallest noise relative to the travel: below it, rounding dominates a filter's variances."""
 
@@ -362,7 +349,7 @@ def maximum_likelihood(
     *,
     order: int,
     bandwidth_limits_hz: tuple[float, float],
-) -> Fit:
+) -> tuple[MotionModel, float]:
     """Choose process and measurement noise of one axis by maximum likelihood.
 
     The measurement noise is at least that of quantisation, resolution²/12 (Widrow 1956), and larger
@@ -376,6 +363,10 @@ def maximum_likelihood(
         resolution: step of the encoder, position units; 0 if unknown.
         order: 3 or 4.
         bandwidth_limits_hz: range of the smoother's bandwidth that is searched.
+
+    Returns:
+        The model, and the log likelihood of all innovations, up to a constant that is the same for
+        all models.
     """
     step, noise = transition(order)
     # The log of a machine at rest may seem free of noise; use the resolution of the numbers then.
@@ -415,4 +406,4 @@ def maximum_likelihood(
     log_ratio = float(found.x)
     total, variance = score(log_ratio)
     model = MotionModel(order, unit * float(np.sqrt(variance)), float(np.exp(log_ratio)), rate_hz)
-    return Fit(model, -total)
+    return model, -total

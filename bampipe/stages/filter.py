@@ -405,15 +405,15 @@ def _choose(
         )
         for order in kalman_smoother.ORDERS
     }
-    fits = {k: found for k, found in fits.items() if np.isfinite(found.log_likelihood)}
+    fits = {k: found for k, found in fits.items() if np.isfinite(found[1])}
     if not fits:
         raise InputError(
             f"no filter can follow the motion of {axis}",
             where=f"encoders.{axis}",
             remedy="check that this is the column of its position, in the right unit",
         )
-    order = max(fits, key=lambda k: fits[k].log_likelihood)
-    best = fits[order].model
+    order = max(fits, key=lambda k: fits[k][1])
+    best, _ = fits[order]
     noise_sd = best.noise_sd
     most = 0.2 * rate
     least = min(config.minimum_bandwidth_hz, most)
@@ -438,9 +438,8 @@ def _choose(
         "bandwidth_reason": why,
         "order": order if kalman else None,
         "measurement_noise_sd": noise_sd,
-        "quantisation_sd": resolution / float(np.sqrt(12.0)),
         "resolution": resolution,
-        "log_likelihood": {str(k): f.log_likelihood for k, f in fits.items()},
+        "log_likelihood": {str(k): likely for k, (_, likely) in fits.items()},
     }
     return AxisFilter(cutoff, noise_sd, order if kalman else 0), report
 

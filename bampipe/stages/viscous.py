@@ -155,7 +155,6 @@ def _estimated(
         trials=tuple(motion.trial_id for motion in motions),
         directions=directions,
         blocks=blocks,
-        process_noise_factor=attempts[found.restarts][2],
         headline="; ".join(
             f"{name} {round_with_sd(entry.estimate, entry.sd)} N.s/m"
             + ("" if command is None else f" ({entry.verdict})")
@@ -220,7 +219,6 @@ def _direction(
         commanded=command,
         p_value=p,
         differs=differs,
-        felt_p_value=felt_p,
         felt_differs=felt_p < _SIGNIFICANT,
         verdict=f"{what} from the commanded {command:.4g}, p = {p:.2g}",
     )

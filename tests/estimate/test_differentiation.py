@@ -50,8 +50,8 @@ def fitted(position: Array) -> Derivatives:
         )
         for order in kalman_smoother.ORDERS
     ]
-    best = max(fits, key=lambda fit: fit.log_likelihood)
-    return kalman_smoother.smooth(position, best.model)
+    best, _ = max(fits, key=lambda fit: fit[1])
+    return kalman_smoother.smooth(position, best)
 
 
 def coverage(found: Derivatives, truth: tuple[Array, Array, Array]) -> list[float]:
