@@ -12,6 +12,7 @@ import numpy as np
 from scipy import stats
 
 from bampipe.arrays import Array
+from bampipe.estimate.bounded import invert_scaled
 
 _LAGS = 20
 """Lags of the whiteness test."""
@@ -97,10 +98,8 @@ def check_independence(
     m = changing.size
     if m == 0 or count < 10 * m or total == 0.0:
         return None
-    scale = np.sqrt(np.diag(products)[changing])
-    moment = products[changing, -1] / scale
-    normal = products[np.ix_(changing, changing)] / np.outer(scale, scale)
-    explained = float(moment @ np.linalg.lstsq(normal, moment, rcond=None)[0])
+    moment = products[changing, -1]
+    explained = float(moment @ invert_scaled(products[np.ix_(changing, changing)]) @ moment)
     rest = count - m - 1
     statistic = (explained / m) / max((total - explained) / rest, 1e-300)
     share = explained / total - m / count

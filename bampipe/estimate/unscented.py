@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.arrays import Array, Flags, Indices
+from bampipe.estimate.bounded import invert_scaled, solve_bounded
 from bampipe.estimate.propagation import Estimated
 from bampipe.estimate.square_root import (
     DONE,
@@ -291,20 +292,10 @@ def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
 
     Parameters outside are put on their bound; the others follow by the covariance (nt, nt).
     """
-    lower = np.where(model.logarithmic, model.range[0], model.lower)
-    upper = model.range[1]
-    held = np.zeros(theta.size, dtype=bool)
-    value = theta
-    for _ in range(theta.size):
-        outside = ~held & ((value < lower) | (value > upper))
-        if not outside.any():
-            break
-        held |= outside
-        shift = np.clip(theta, lower, upper)[held] - theta[held]
-        pull = np.linalg.lstsq(covariance[np.ix_(held, held)], shift, rcond=None)[0]
-        value = theta + covariance[:, held] @ pull
-        value[held] = np.clip(theta, lower, upper)[held]
-    return np.asarray(value)
+    lower, upper = np.where(model.logarithmic, model.range[0], model.lower), model.range[1]
+    precision, nothing = invert_scaled(covariance), np.zeros(theta.size)
+    change = solve_bounded(precision, nothing, lower - theta, upper - theta)
+    return np.asarray(np.clip(theta + change, lower, upper))
 
 
 def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:
