@@ -126,7 +126,7 @@ _PASS = types.Tuple((_M, float64[:, :, ::1], _M, _V, _V))
 innovations (T,) and their variances (T,)."""
 
 
-@njit(_PASS(_V, _FLAGS, _M, _M, _V, _M), cache=True)
+@njit(_PASS(_V, _FLAGS, _M, _M, _V, _M))
 def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
     """Run the filter from prior ``x``, ``p`` for the first sample and return what it passes.
 
@@ -158,7 +158,7 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
     return states, covariances, gains, innovations, spreads
 
 
-@njit(void(_FLAGS, _M, _PASS, _M), cache=True)
+@njit(void(_FLAGS, _M, _PASS, _M))
 def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
     """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n)."""
     states, covariances, gains, innovations, spreads = passed
@@ -278,7 +278,7 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
 
 
-@njit(_M(_V, _M, _M, float64[:, :, ::1], _V), cache=True)
+@njit(_M(_V, _M, _M, float64[:, :, ::1], _V))
 def _smooth_mean(y, step, gains, covariances, spreads):  # type: ignore[no-untyped-def]
     """Return smoothed states (T, n) of complete samples.
 

@@ -21,7 +21,7 @@ _TOGETHER = 4
 side by side take hardly longer than one."""
 
 
-@njit(_M(_M, _V, _V, int64[::1]), cache=True)
+@njit(_M(_M, _V, _V, int64[::1]))
 def _run(values, section, start, kept):  # type: ignore[no-untyped-def]
     count, columns = values.shape
     y, out = np.zeros((count, _TOGETHER)), np.empty((len(kept), columns))
