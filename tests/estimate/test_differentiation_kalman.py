@@ -124,18 +124,6 @@ def test_a_trial_at_rest() -> None:
 
 
 @pytest.mark.parametrize("order", ks.ORDERS)
-def test_what_is_smoothed_without_variances_is_the_same(order: int) -> None:
-    """A signal that jumps, as play does, to a millionth of its spread."""
-    signal = walk(order, 4e-5, 900, 6)[:, 0]
-    signal[300:500] += np.std(signal)
-    model = ks.MotionModel(order, 1e-4, ks.ratio_for(40.0, order, RATE), RATE)
-    whole = ks.smooth(signal, model)
-    wanted = whole.position, whole.velocity, whole.acceleration
-    for found, expected in zip(ks.smooth_mean(signal, model), wanted, strict=True):
-        assert np.abs(found - expected).max() < 1e-5 * np.std(expected)
-
-
-@pytest.mark.parametrize("order", ks.ORDERS)
 def test_the_likelihood_is_that_of_every_innovation(order: int) -> None:
     """Of a slow motion, the variance of the innovations rests long before the gains settle."""
     y = np.random.default_rng(0).standard_normal(6000)
