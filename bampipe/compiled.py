@@ -10,9 +10,8 @@ Processes that start together share the work: what one of them is compiling, ano
 """
 
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from inspect import isfunction
 from pathlib import Path
 from typing import Any
 
@@ -27,39 +26,29 @@ _PATIENCE_S = 60.0
 """Time to wait for another process before compiling its function here."""
 
 
-def njit(*signatures: Any, **options: Any) -> Any:
-    """``numba.njit`` whose ``cache=True`` keeps code as this module describes.
+def njit(signature: Any, **options: Any) -> Any:
+    """``numba.njit`` for one signature, whose code is kept as this module describes.
 
     Args:
-        signatures: at most one signature, or a list of them; with none, types are taken from the
-            first call. As in numba, a bare function may stand here.
         options: those of ``numba.njit``. A function that others take as an argument needs
             ``no_cfunc_wrapper=False``: the entry point for that is a tenth of the time to compile.
     """
-    if signatures and isfunction(signatures[0]):
-        return numba.njit(signatures[0])
-    cached = options.pop("cache", False)
     options.setdefault("no_cfunc_wrapper", True)
-    wanted = list(signatures)
-    if wanted and isinstance(wanted[0], list):
-        wanted = wanted[0]
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
-        if cached:
-            with suppress(InputError, OSError):  # no folder: every process compiles for itself
-                dispatcher._cache = _Cache(function)
-        if wanted:
-            _promise(dispatcher, wanted)
-            if not options["no_cfunc_wrapper"]:
-                dispatcher.compile_promised()
+        with suppress(InputError, OSError):  # no folder: every process compiles for itself
+            dispatcher._cache = _Cache(function)
+        _promise(dispatcher, signature)
+        if not options["no_cfunc_wrapper"]:
+            dispatcher.compile_promised()
         return dispatcher
 
     return decorate
 
 
-def _promise(dispatcher: Any, signatures: Sequence[Any]) -> None:
-    """Compile a function for its signatures at its first call from Python."""
+def _promise(dispatcher: Any, signature: Any) -> None:
+    """Compile a function for its signature at its first call from Python."""
 
     def compile_promised(*arguments: Any) -> Any:
         del dispatcher._compile_for_args
@@ -68,8 +57,7 @@ def _promise(dispatcher: Any, signatures: Sequence[Any]) -> None:
             _collector_at_rest(),
             _one_process_at_a_time(dispatcher._cache),
         ):
-            for signature in signatures:
-                dispatcher.compile(signature)
+            dispatcher.compile(signature)
         dispatcher.disable_compile()
         return dispatcher  # numba's hook
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import load_model, read_estimate
 from bampipe.identification.identifiability import find_information
-from bampipe.identification.sensor_noise import FilterChoice, sensor_noise
+from bampipe.identification.sensor_noise import FilterChoice, untuned_settings
 from bampipe.next_trial.primitives import (
     Envelope,
     Primitive,
@@ -62,7 +62,7 @@ class Session:
         self.motions = [trials.motions[k] for k in trials.folds.fitted_trials]
         self.band, self.timed = trials.band, found.input_timing.limit > 0.0
         self.full = np.append(p, found.input_timing.estimate)
-        self.noise = sensor_noise(trials.sensors, self.system, self.motions, p, FilterChoice())
+        self.noise = untuned_settings(trials.sensors, self.system, self.motions, p, FilterChoice())
         self.seen = Envelope.of_trials(trials.motions, self.system, p)
         self.rehearsal = Rehearsal(self.system, p, trials.sensors, trials.kinematics, self.seen, 0)
         problem = problem_of(self.system, self.motions[:1], self.band, timing=self.timed)

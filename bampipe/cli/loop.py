@@ -78,8 +78,7 @@ def extend(
         ),
     ] = None,
     auto: Annotated[
-        bool,
-        typer.Option("--auto", help="Diagnose and add effects until nothing is missing."),
+        bool, typer.Option("--auto", help="Diagnose and add effects until nothing is missing.")
     ] = False,
     draft: Annotated[
         bool,

@@ -51,8 +51,7 @@ def monitor(
         float, typer.Option("--false-alarms", help="False alarms of a consistent filter, per hour.")
     ] = 1.0,
     memory_s: Annotated[
-        float,
-        typer.Option("--memory", help="Time in which parameters may drift by their sd, s."),
+        float, typer.Option("--memory", help="Time in which parameters may drift by their sd, s.")
     ] = 60.0,
     once: Annotated[
         bool, typer.Option("--once", help="Stop at the end of the file; do not wait for more.")

@@ -43,10 +43,7 @@ def run(
     scheduler: Annotated[
         str, typer.Option(help="Address of the Dask scheduler, tcp://host:port.")
     ] = "",
-    first: Annotated[
-        str,
-        typer.Option("--from", metavar="STAGE", help="First stage to run."),
-    ] = "",
+    first: Annotated[str, typer.Option("--from", metavar="STAGE", help="First stage to run.")] = "",
     last: Annotated[
         str, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")
     ] = "",

@@ -7,15 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, PrivateAttr, StringConstraints
 
-from bampipe.errors import InputError, choose_from
-from bampipe.schema import Declaration, Distinct, Number, Several, Text, fault
+from bampipe.errors import InputError
+from bampipe.schema import Declaration, Distinct, Number, Several, Text, checked_by, fault
 from bampipe.stages import base
-
-
-def _known_stage(name: str) -> str:
-    if name not in base.STAGES:
-        raise fault(f"no stage {name!r}", remedy=choose_from(name, base.STAGES))
-    return name
 
 
 def _in_order(stages: tuple[str, ...]) -> tuple[str, ...]:
@@ -28,7 +22,7 @@ def _in_order(stages: tuple[str, ...]) -> tuple[str, ...]:
     return stages
 
 
-StageName = Annotated[str, AfterValidator(_known_stage)]
+StageName = Annotated[str, AfterValidator(checked_by(base.check_stage_name))]
 NumberPath = Annotated[
     str,
     StringConstraints(pattern=r"^[^*]*(\*[^*]*)?$"),

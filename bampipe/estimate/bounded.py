@@ -10,17 +10,12 @@ Coefficients with equal bounds are held at that value.
 """
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import lsq_linear
 
 from bampipe.arrays import Array, Flags
 
 _RANK_TOLERANCE = 1e-12
 """Eigenvalues below this share of the largest, at unit diagonal, are rounding errors."""
-_DETERMINED = 1e-6
-"""A Cholesky factor whose squared pivots exceed this, at unit diagonal, is well determined."""
-_MOST_CHANGES = 20
-"""Changes of the active set before the method that always terminates takes over."""
 
 
 def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, Flags]:
@@ -62,9 +57,6 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> A
         normal: (n, n) slope^T slope; moment: (n,) slope^T measured, with any weights.
         lower, upper: (n,), infinite without a bound, equal for a fixed coefficient.
     """
-    quick = _solve_definite(normal, moment, lower, upper)
-    if quick is not None:
-        return quick
     x = np.array(lower, dtype=float)
     open_ = np.flatnonzero(lower < upper)
     held = np.flatnonzero(~(lower < upper))
@@ -89,8 +81,9 @@ def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> A
     x = np.where(at < 0, lower, upper)
     # Take only the active set: along undetermined directions, free coefficients reach 1e12.
     inside = at == 0
-    rest = (moment - normal[:, ~inside] @ x[~inside])[inside]
-    x[inside] = _least_norm(scaled_eigenbasis(normal[np.ix_(inside, inside)]), rest)
+    if inside.any():
+        rest = (moment - normal[:, ~inside] @ x[~inside])[inside]
+        x[inside] = _least_norm(scaled_eigenbasis(normal[np.ix_(inside, inside)]), rest)
     return np.asarray(np.clip(x, lower, upper))
 
 
@@ -103,37 +96,3 @@ def _least_norm(basis: tuple[Array, Array, Array, Flags], moment: Array) -> Arra
     scale, values, vectors, null = basis
     along = vectors.T @ (moment / scale) / np.where(null, 1.0, values)
     return np.asarray(vectors @ np.where(null, 0.0, along) / scale)
-
-
-def _solve_definite(normal: Array, moment: Array, lower: Array, upper: Array) -> Array | None:
-    """Solve a determined problem by Cholesky factors of the unbounded part.
-
-    Coefficients beyond a bound are put on it, and released if the slope leads back inside, until
-    neither happens. Returns None if a direction is undetermined or the active set does not settle.
-    """
-    diagonal = np.diag(normal)
-    if not (diagonal > 0.0).all():
-        return None
-    scale = np.sqrt(diagonal)
-    matrix, target = normal / np.outer(scale, scale), moment / scale
-    low, high = lower * scale, upper * scale
-    held = ~(lower < upper)
-    x, fixed = np.where(held, low, 0.0), held.copy()
-    for _ in range(_MOST_CHANGES):
-        free = ~fixed
-        if free.any():
-            try:
-                factor = cho_factor(matrix[np.ix_(free, free)], lower=True)
-            except np.linalg.LinAlgError:
-                return None
-            if np.diag(factor[0]).min() ** 2 < _DETERMINED:
-                return None
-            x[free] = cho_solve(factor, target[free] - matrix[np.ix_(free, fixed)] @ x[fixed])
-        beyond = free & ((x < low) | (x > high))
-        slope = matrix @ x - target
-        back = fixed & ~held & (((x <= low) & (slope < 0.0)) | ((x >= high) & (slope > 0.0)))
-        if not beyond.any() and not back.any():
-            return np.where(held | (x <= low), lower, np.where(x >= high, upper, x / scale))
-        x[beyond] = np.clip(x[beyond], low[beyond], high[beyond])
-        fixed = (fixed | beyond) & ~back
-    return None

@@ -3,7 +3,6 @@
 from functools import lru_cache
 
 import numpy as np
-from scipy.signal import periodogram
 
 from bampipe.arrays import Array
 from bampipe.estimate.differentiation import Derivatives, extend
@@ -88,26 +87,3 @@ def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -
     full[:, :edge] = gains[:, :edge]
     full[:, length - edge :] = gains[:, window - edge :]
     return Derivatives(*zero_phase(position, rate_hz, cutoff_hz), *(noise_sd * full))
-
-
-def floor_frequency(position: Array, rate_hz: float, noise_sd: float) -> float:
-    """Return the frequency, Hz, above which the spectrum of ``position`` (T,) is only noise.
-
-    Noise of standard deviation ``noise_sd`` has the density 2 noise_sd² / rate. The result is the
-    highest frequency up to which the spectral density, averaged over a third of an octave, stays
-    above twice that, so that the signal is as strong as the noise. A line through the end points is
-    subtracted and a Blackman window applied, so that leakage stays below the floor.
-    """
-    steps = np.arange(len(position))
-    line = np.interp(steps, (0, len(position) - 1), (position[0], position[-1]))
-    frequency, density = periodogram(position - line, fs=rate_hz, window="blackman", detrend=False)
-    floor = 2.0 * noise_sd**2 / rate_hz
-    band, limit = 2.0 * rate_hz / len(position), float(frequency[-1])
-    lower = 8.0 * band
-    while lower < limit:
-        upper = lower * 2.0 ** (1.0 / 3.0)
-        inside = (frequency >= lower) & (frequency < upper)
-        if not np.any(inside) or float(np.mean(density[inside])) < 2.0 * floor:
-            return lower
-        lower = upper
-    return limit

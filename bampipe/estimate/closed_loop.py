@@ -32,7 +32,6 @@ def _act(command, states, limits, y, r, dt, out):  # type: ignore[no-untyped-def
     void(
         DERIVATIVE, MEASURE, COMMAND, _M, _M, _M, _M, PLANT, int64[::1], _V, _M, int64, float64
     ),
-    cache=True,
 )  # fmt: skip
 def _close(  # type: ignore[no-untyped-def]
     derivative, measure, command, x, u, r, readings, plant, columns, states, limits, ticks, dt

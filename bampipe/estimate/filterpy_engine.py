@@ -46,7 +46,6 @@ def _filter(
     model: FilterModel,
     settings: FilterSettings,
     advance: Callable[..., None],
-    index: int,
     trial: Trial,
     theta: Array,
     covariance: Array,
@@ -73,7 +72,7 @@ def _filter(
                 ukf.x[nx:n] = np.clip(ukf.x[nx:n], lower, upper)
         except np.linalg.LinAlgError as error:
             reason = "the covariance of the state lost positive definiteness"
-            raise FilterFailure(index, k, reason) from error
+            raise FilterFailure(k, reason) from error
         if k % settings.stride == 0:
             means.append(ukf.x[:n].copy())
             covariances.append(ukf.P[:n, :n].copy())

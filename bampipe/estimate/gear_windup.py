@@ -7,6 +7,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.errors import InputError
+from bampipe.estimate.bounded import invert_scaled
 
 _BLOCKS = 20
 """Parts of the record with independent errors, whose scatter gives the uncertainties."""
@@ -80,20 +81,17 @@ def find_windup(
         columns.append(np.column_stack([part - part.mean() for part in parts]))
         target.append(d - d.mean())
     table, wanted = np.vstack(columns), np.concatenate(target)
-    size = np.maximum(np.linalg.norm(table, axis=0), 1e-300)
-    table = table / size
-    inverse = np.linalg.pinv(table.T @ table)
+    inverse = invert_scaled(table.T @ table)
     found = inverse @ (table.T @ wanted)
     left = wanted - table @ found
     blocks = (np.array_split(rows, _BLOCKS) for rows in (table, left))
     scores = [part.T @ rest for part, rest in zip(*blocks, strict=True)]
     covariance = inverse @ sum(np.outer(s, s) for s in scores) @ inverse
     sd = np.sqrt(np.diag(covariance) * _BLOCKS / (_BLOCKS - len(found)))
-    values, errors = found / size, sd / size
-    play = len(values) - 1
+    play = len(found) - 1
     rest = wanted - table[:, :own] @ np.linalg.lstsq(table[:, :own], wanted, rcond=None)[0]
     return Windup(
-        float(values[own]), float(errors[own]), float(values[play]) if crossed else None,
-        float(errors[play]) if crossed else None, -float(values[0]), float(errors[0]),
+        float(found[own]), float(sd[own]), float(found[play]) if crossed else None,
+        float(sd[play]) if crossed else None, -float(found[0]), float(sd[0]),
         float(1.0 - np.var(left) / max(float(np.var(rest)), 1e-300)),
     )  # fmt: skip

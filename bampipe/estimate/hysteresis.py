@@ -97,7 +97,6 @@ class Hysteresis:
             all branches, whichever is larger.
         systematic: uncertainty of the stiffness due to the rest of the transition: a quarter of the
             change of the slope, or of the standard error of that change if larger.
-        scatter: standard deviation over the cycles; for one cycle, that of its regression.
         cycles: results by cycle.
         branches: all whole branches.
         transition: torque after a reversal from which the loop counts as post-yield, N.m or N.
@@ -110,7 +109,6 @@ class Hysteresis:
     stiffness: float
     standard_error: float
     systematic: float
-    scatter: float
     cycles: tuple[Cycle, ...]
     branches: tuple[Branch, ...]
     transition: float
@@ -287,12 +285,12 @@ def measure_hysteresis(torque: Array, deflection: Array, rate_hz: float) -> Hyst
     stiffness = 1.0 / line.compliance
     standard_error = line.error * stiffness**2
     values = [cycle.stiffness for cycle in cycles]
-    scatter = float(np.std(values, ddof=1)) if len(values) > 1 else standard_error
+    scatter = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
     return Hysteresis(
         stiffness=stiffness,
         standard_error=max(standard_error, scatter / float(np.sqrt(len(values)))),
         systematic=_SYSTEMATIC * stiffness * max(abs(slope_change), slope_change_error),
-        scatter=scatter, cycles=cycles, branches=branches, transition=start,
+        cycles=cycles, branches=branches, transition=start,
         slope_change=slope_change,
         yielded=abs(slope_change) < max(_LARGEST_SLOPE_CHANGE, 3.0 * slope_change_error),
     )  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import stats
 
 from bampipe.arrays import Array
+from bampipe.estimate.bounded import invert_scaled
 
 _LAGS = 20
 """Lags of the whiteness test."""
@@ -22,13 +23,10 @@ class InnovationTest:
     """Outcome of one test.
 
     Attributes:
-        statistic: Ljung-Box Q, or F of the regression; degrees: degrees of freedom.
-        p_value: probability of a statistic as large by chance.
+        p_value: probability of a statistic as large by chance: Ljung-Box Q, F of the regression.
         share: predictable fraction of the variance, beyond that expected by chance.
     """
 
-    statistic: float
-    degrees: int
     p_value: float
     share: float
 
@@ -67,9 +65,7 @@ def check_whiteness(records: Sequence[Array]) -> InnovationTest | None:
     correlation = products / counts / variance
     statistic = float((size + 2.0) / size * np.sum(counts * correlation**2))
     share = float(np.sum(correlation**2 - 1.0 / counts))
-    return InnovationTest(
-        statistic, _LAGS, float(stats.chi2.sf(statistic, _LAGS)), min(max(share, 0.0), 1.0)
-    )
+    return InnovationTest(float(stats.chi2.sf(statistic, _LAGS)), min(max(share, 0.0), 1.0))
 
 
 def check_independence(
@@ -102,13 +98,9 @@ def check_independence(
     m = changing.size
     if m == 0 or count < 10 * m or total == 0.0:
         return None
-    scale = np.sqrt(np.diag(products)[changing])
-    moment = products[changing, -1] / scale
-    normal = products[np.ix_(changing, changing)] / np.outer(scale, scale)
-    explained = float(moment @ np.linalg.lstsq(normal, moment, rcond=None)[0])
+    moment = products[changing, -1]
+    explained = float(moment @ invert_scaled(products[np.ix_(changing, changing)]) @ moment)
     rest = count - m - 1
     statistic = (explained / m) / max((total - explained) / rest, 1e-300)
     share = explained / total - m / count
-    return InnovationTest(
-        statistic, m, float(stats.f.sf(statistic, m, rest)), min(max(share, 0.0), 1.0)
-    )
+    return InnovationTest(float(stats.f.sf(statistic, m, rest)), min(max(share, 0.0), 1.0))

@@ -27,8 +27,6 @@ from bampipe.estimate.differentiation import Derivatives
 ORDERS = (3, 4)
 _SETTLED = 1e-10
 """Relative change of the gains from sample to sample below which they are constant."""
-_WIDE = 1e8
-"""Ratio of the prior variance of an unknown initial state to its later variance."""
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -62,16 +60,6 @@ def _advance(x, step):  # type: ignore[no-untyped-def]
         for j in range(i, x.shape[0]):
             total += step[i, j] * x[j]
         x[i] = total
-
-
-@part()
-def _carry_back(adjoint, step):  # type: ignore[no-untyped-def]
-    """Carry ``adjoint`` (n,) back by one sample, in place: F' adjoint."""
-    for i in range(adjoint.shape[0] - 1, -1, -1):
-        total = 0.0
-        for j in range(i + 1):
-            total += step[j, i] * adjoint[j]
-        adjoint[i] = total
 
 
 @part()
@@ -126,7 +114,7 @@ _PASS = types.Tuple((_M, float64[:, :, ::1], _M, _V, _V))
 innovations (T,) and their variances (T,)."""
 
 
-@njit(_PASS(_V, _FLAGS, _M, _M, _V, _M), cache=True)
+@njit(_PASS(_V, _FLAGS, _M, _M, _V, _M))
 def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
     """Run the filter from prior ``x``, ``p`` for the first sample and return what it passes.
 
@@ -158,7 +146,7 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
     return states, covariances, gains, innovations, spreads
 
 
-@njit(void(_FLAGS, _M, _PASS, _M), cache=True)
+@njit(void(_FLAGS, _M, _PASS, _M))
 def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
     """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n)."""
     states, covariances, gains, innovations, spreads = passed
@@ -189,7 +177,11 @@ def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
                 weight[i, 0] -= pull[i]
                 weight[0, i] -= pull[i]
         # adjoint <- F' adjoint, weight <- F' weight F
-        _carry_back(adjoint, step)
+        for i in range(n - 1, -1, -1):
+            total = 0.0
+            for j in range(i + 1):
+                total += step[j, i] * adjoint[j]
+            adjoint[i] = total
         for i in range(n):
             for j in range(n):
                 total = 0.0
@@ -278,79 +270,6 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
 
 
-@njit(_M(_V, _M, _M, float64[:, :, ::1], _V), cache=True)
-def _smooth_mean(y, step, gains, covariances, spreads):  # type: ignore[no-untyped-def]
-    """Return smoothed states (T, n) of complete samples.
-
-    The recursions are those of `_filter` and `_smooth`, without the parts that are equal for all
-    samples.
-    """
-    count, n, last = y.shape[0], step.shape[0], spreads.shape[0] - 1
-    states, innovations, adjoint = np.empty((count, n)), np.empty(count), np.zeros(n)
-    for i in range(n):
-        states[0, i] = y[0] if i == 0 else 0.0
-    for t in range(count):
-        if t > 0:
-            for i in range(n):
-                states[t, i] = states[t - 1, i]
-            _advance(states[t], step)
-        innovations[t] = y[t] - states[t, 0]
-        for i in range(n):
-            states[t, i] += gains[min(t, last), i] * innovations[t]
-    for t in range(count - 1, -1, -1):
-        k = min(t, last)
-        share = innovations[t] / spreads[k]
-        for i in range(n):
-            states[t, i] -= _multiply_row(covariances[k], i, adjoint)
-            share += gains[k, i] * adjoint[i]
-        adjoint[0] -= share
-        _carry_back(adjoint, step)
-    return states
-
-
-@lru_cache(maxsize=16)
-def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
-    """Gains (K, n), covariances (K, n, n) and variances (K,) until they settle, at most ``most``.
-
-    They do not depend on the samples. The initial state is unknown.
-    """
-    step, noise = transition(order)
-    # The settled size of a state is about the cut-off, rad per sample, to the power of its order.
-    wide = np.diag(_WIDE * ratio ** (np.arange(order) / order))
-    there = np.ones(most, dtype=bool)
-    passed = _filter(np.zeros(most), there, step, ratio * noise, np.zeros(order), wide)
-    _, covariances, gains, _, spreads = passed
-    # Gains oscillate as they settle, so a momentary rest is not enough.
-    change = np.abs(np.diff(gains, axis=0))
-    settled = np.flatnonzero((change < _SETTLED * gains[1:]).all(axis=1))
-    count = int(settled[0]) + 2 if settled.size else most
-    return gains[:count].copy(), covariances[:count].copy(), spreads[:count].copy()
-
-
-def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]:
-    """Apply `smooth` to a signal without gaps: position, rate and acceleration, each (T,).
-
-    This takes a tenth of the time, because no variances are computed.
-    """
-    step, _ = transition(model.order)
-    y = np.ascontiguousarray(signal, dtype=np.float64)
-    states = _smooth_mean(y, step, *_settled(model.order, model.ratio, len(signal)))
-    return states[:, 0], states[:, 1] * model.rate_hz, states[:, 2] * model.rate_hz**2
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A motion model chosen by maximum likelihood.
-
-    Attributes:
-        model: the chosen model.
-        log_likelihood: of all innovations, up to a constant that is the same for all models.
-    """
-
-    model: MotionModel
-    log_likelihood: float
-
-
 _FINEST = 1e-8
 """Smallest noise relative to the travel: below it, rounding dominates a filter's variances."""
 
@@ -362,7 +281,7 @@ def maximum_likelihood(
     *,
     order: int,
     bandwidth_limits_hz: tuple[float, float],
-) -> Fit:
+) -> tuple[MotionModel, float]:
     """Choose process and measurement noise of one axis by maximum likelihood.
 
     The measurement noise is at least that of quantisation, resolution²/12 (Widrow 1956), and larger
@@ -376,6 +295,10 @@ def maximum_likelihood(
         resolution: step of the encoder, position units; 0 if unknown.
         order: 3 or 4.
         bandwidth_limits_hz: range of the smoother's bandwidth that is searched.
+
+    Returns:
+        The model, and the log likelihood of all innovations, up to a constant that is the same for
+        all models.
     """
     step, noise = transition(order)
     # The log of a machine at rest may seem free of noise; use the resolution of the numbers then.
@@ -415,4 +338,4 @@ def maximum_likelihood(
     log_ratio = float(found.x)
     total, variance = score(log_ratio)
     model = MotionModel(order, unit * float(np.sqrt(variance)), float(np.exp(log_ratio)), rate_hz)
-    return Fit(model, -total)
+    return model, -total

@@ -33,9 +33,9 @@ _LARGEST = 1e100
 """A residual or slope above this has no finite square."""
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
-Slopes = Callable[[int, Array, Sequence[int]], tuple[Sequence[int], Array]]
-"""slopes(trial, p, wanted) -> indices within ``wanted`` of free parameters whose slopes need no
-finite differences, and the unfiltered slopes of the residual by them (T, n_q, n)."""
+Slopes = Callable[[int, Array], tuple[Sequence[int], Array]]
+"""slopes(trial, p) -> numbers of the free parameters whose slopes need no finite differences, and
+the unfiltered slopes of the residual by them (T, n_q, n)."""
 
 
 class NotFinite(InputError):
@@ -58,19 +58,6 @@ class Stacked:
 
 
 @dataclass(frozen=True)
-class KnownSlopes:
-    """Slopes of the residual from an earlier fit that remain valid.
-
-    Attributes:
-        take: returns the slopes of a trial, low-passed and thinned, (K, n_q, n_free).
-        holds: (n_free,) which of these columns are valid.
-    """
-
-    take: Callable[[int], Array]
-    holds: Flags
-
-
-@dataclass(frozen=True)
 class Problem:
     """A least-squares problem: a model as a function that returns residuals.
 
@@ -82,7 +69,6 @@ class Problem:
         step: (n_free,) sizes of their finite differences; any size is exact if the residual is
             linear in the parameter.
         linear: whether the residual is linear in all of them.
-        constant: (n_free,) parameters by which the slope is the same everywhere.
         band: the low-pass.
         standstill: by trial, (T, n_q) whether an axis stands still; see `find_standstill`.
         precision: (n_free,) inverse variances of the priors, zero without a prior; known: (n_free,)
@@ -103,7 +89,6 @@ class Problem:
     upper: Array
     step: Array
     linear: bool
-    constant: Flags
     band: Band
     standstill: Sequence[Flags]
     precision: Array
@@ -114,45 +99,34 @@ class Problem:
     keep: Callable[[Iterable[Stacked]], Sequence[Stacked]] = list
 
 
-def residual_and_slopes(
-    problem: Problem, trial: int, p: Array, columns: Sequence[int] | None = None
-) -> tuple[Array, Array]:
-    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n) at ``p`` (np,).
+def residual_and_slopes(problem: Problem, trial: int, p: Array) -> tuple[Array, Array]:
+    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n_free) at ``p`` (np,).
 
     Slopes that the model does not supply are finite differences, forward, or backward at a bound.
-    ``columns`` are the free parameters by which slopes are taken, by number; all by default.
     """
     base = problem.residual(trial, p)
-    chosen = range(problem.free.size) if columns is None else columns
+    slopes = np.empty((*base.shape, problem.free.size))
     given: Sequence[int] = ()
     if problem.slopes is not None:
-        given, known = problem.slopes(trial, p, chosen)
-        if list(given) == list(range(len(chosen))):
-            return base, known
-    slopes = np.empty((*base.shape, len(chosen)))
-    if given:
+        given, known = problem.slopes(trial, p)
         slopes[:, :, given] = known
-    for column in sorted(set(range(len(chosen))) - set(given)):
-        k = chosen[column]
+    for k in sorted({*range(problem.free.size)} - {*given}):
         index, moved = problem.free[k], p.copy()
         # A replicate of an incomplete model can run far from any prior, where a step is rounding.
         step = max(problem.step[k], _LEAST_STEP * abs(p[index]))
         moved[index] += step
         if moved[index] > problem.upper[k]:
             moved[index] = p[index] - step
-        slopes[:, :, column] = (problem.residual(trial, moved) - base) / (moved[index] - p[index])
+        slopes[:, :, k] = (problem.residual(trial, moved) - base) / (moved[index] - p[index])
     return base, slopes
 
 
-def stacked_residual(
-    problem: Problem, trial: int, p: Array, known: KnownSlopes | None = None
-) -> Stacked:
+def stacked_residual(problem: Problem, trial: int, p: Array) -> Stacked:
     """Low-pass and thin the residual of one trial and its slope by every free parameter.
 
-    It is linearised at ``p`` (np,); slopes in ``known`` remain valid.
+    It is linearised at ``p`` (np,).
     """
-    fresh = np.arange(problem.free.size) if known is None else np.flatnonzero(~known.holds)
-    base, slopes = residual_and_slopes(problem, trial, p, [int(k) for k in fresh])
+    base, slopes = residual_and_slopes(problem, trial, p)
     count, n_q, n_free = slopes.shape
     # A body of a robot does not act on joints behind it: half of the columns are empty.
     axes, numbers = np.nonzero(slopes.any(axis=0))
@@ -163,12 +137,8 @@ def stacked_residual(
     still = problem.standstill[trial]
     moving = (find_moving_samples(still[part], problem.band) for part in problem.parts(trial))
     used = np.concatenate([*moving])
-    if known is None:
-        slope = np.zeros((len(thin), n_q, n_free))
-    else:
-        slope = known.take(trial).copy()
-        slope[:, :, fresh] = 0.0
-    slope[:, axes, fresh[numbers]] = thin[:, n_q:] * used[:, axes]
+    slope = np.zeros((len(thin), n_q, n_free))
+    slope[:, axes, numbers] = thin[:, n_q:] * used[:, axes]
     return Stacked(thin[:, :n_q] * used, slope, used)
 
 
@@ -178,7 +148,6 @@ def minimise(
     trials: Sequence[int] | None = None,
     most_iterations: int = 30,
     *,
-    known: KnownSlopes | None = None,
     tolerance: float = 1e-10,
 ) -> Linearised:
     """Minimise the sum of squares, weighted by axis, over the free parameters within bounds.
@@ -189,7 +158,6 @@ def minimise(
     Args:
         start: (np,) parameters to start from; trials: numbers of those to use, all by default.
         most_iterations: largest number of Gauss-Newton steps; 0 only linearises at ``start``.
-        known: slopes that remain valid.
         tolerance: change of the negative log likelihood per sample at which the descent ends.
 
     Raises:
@@ -199,7 +167,7 @@ def minimise(
     chosen = list(range(problem.n_trials)) if trials is None else list(trials)
     p = np.array(start, dtype=float)
     p[problem.free] = np.clip(p[problem.free], problem.lower, problem.upper)
-    stacked = problem.keep(stacked_residual(problem, k, p, known) for k in chosen)
+    stacked = problem.keep(stacked_residual(problem, k, p) for k in chosen)
     for trial, s in zip(chosen, stacked, strict=True):
         _require_finite(problem, trial, s, p)
     if most_iterations and sum(int(s.used.sum()) for s in stacked) <= problem.free.size:
@@ -262,12 +230,7 @@ class Linearised:
                 Stacked(s.residual + s.slope @ step, s.slope, s.used) for s in self.stacked
             )
         else:
-            known = KnownSlopes(
-                lambda trial: self.stacked[self.trials.index(trial)].slope, self.problem.constant
-            )
-            stacked = self.problem.keep(
-                stacked_residual(self.problem, k, p, known) for k in self.trials
-            )
+            stacked = self.problem.keep(stacked_residual(self.problem, k, p) for k in self.trials)
         return replace(self, p=p, stacked=stacked)
 
 

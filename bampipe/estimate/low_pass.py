@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import groupby, islice
 
 import numpy as np
 from numba import float64, int64
@@ -21,7 +20,7 @@ _TOGETHER = 4
 side by side take hardly longer than one."""
 
 
-@njit(_M(_M, _V, _V, int64[::1]), cache=True)
+@njit(_M(_M, _V, _V, int64[::1]))
 def _run(values, section, start, kept):  # type: ignore[no-untyped-def]
     count, columns = values.shape
     y, out = np.zeros((count, _TOGETHER)), np.empty((len(kept), columns))
@@ -137,16 +136,8 @@ class Band:
         return out
 
     def thin_trials(self, trials: Iterable[Array], axes: Sequence[int]) -> list[Array]:
-        """Apply `thin` to the same columns, each (T, k), of several trials.
-
-        Consecutive trials of one length and few columns go through the filter side by side.
-        """
-        found: list[Array] = []
-        for _, alike in groupby(trials, key=len):
-            while few := list(islice(alike, _TOGETHER)):
-                thin = self.thin(np.concatenate(few, axis=1), [*axes] * len(few))
-                found += np.split(thin, len(few), axis=1)
-        return found
+        """Apply `thin` to the same columns, each (T, k), of several trials."""
+        return [self.thin(values, axes) for values in trials]
 
     def thin_input(self, values: Array) -> Array:
         """Apply `thin` with the highest cut-off to columns (T, k) that belong to no axis."""

@@ -6,13 +6,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.estimate.square_root import FilterSettings
-from bampipe.estimate.unscented import (
-    FilteredTrial,
-    FilterModel,
-    Trial,
-    join_roots,
-    run_kernel,
-)
+from bampipe.estimate.unscented import FilteredTrial, FilterModel, Trial, join_roots, run_kernel
 
 
 class OnlineFilter:

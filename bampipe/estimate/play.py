@@ -10,7 +10,7 @@ from bampipe.arrays import Array
 from bampipe.compiled import njit
 
 
-@njit("float64[:, ::1](float64[::1], float64[::1])", cache=True)
+@njit("float64[:, ::1](float64[::1], float64[::1])")
 def drag_along(x: Array, play: Array) -> Array:
     """Return positions (T, G) of points that stay within ``play`` (G,) of ``x`` (T,)."""
     out = np.empty((x.shape[0], play.shape[0]))

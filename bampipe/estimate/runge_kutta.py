@@ -17,7 +17,7 @@ def _read_input(u0, u1, c0, c1, dt, share, u):  # type: ignore[no-untyped-def]
         u[i] = u0[i] + (u1[i] - u0[i]) * share + dt * dt / 6.0 * (c0[i] * before + c1[i] * after)
 
 
-@njit(void(DERIVATIVE, *[_V] * 7, float64, int64, float64[:, ::1]), cache=True)
+@njit(void(DERIVATIVE, *[_V] * 7, float64, int64, float64[:, ::1]))
 def runge_kutta(derivative, x, u0, u1, c0, c1, p, w, dt, substeps, work):  # type: ignore[no-untyped-def]
     """Advance ``x`` in place by ``dt``: classical fourth order, eq 22 with k4 at x + delta k3.
 

@@ -132,7 +132,7 @@ def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 
-@njit(int64(DERIVATIVE, _M, _M, PLANT, float64), cache=True)
+@njit(int64(DERIVATIVE, _M, _M, PLANT, float64))
 def _count_steps(derivative, x, u, plant, dt):  # type: ignore[no-untyped-def]
     """Sum of `stable_steps` over states (K, nx) and inputs (K, nu)."""
     total, work = 0, np.zeros((8, x.shape[1]))
@@ -183,7 +183,7 @@ def _solve_goal(derivative, x, u, plant, arm, k, out):  # type: ignore[no-untype
         out[j] /= factor[j, j]
 
 
-@njit(void(DERIVATIVE, _M, _M, PLANT, _ARM, _I, _M, float64), cache=True)
+@njit(void(DERIVATIVE, _M, _M, PLANT, _ARM, _I, _M, float64))
 def _run(derivative, x, u, plant, arm, brake, brake_gain, dt):  # type: ignore[no-untyped-def]
     """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``.
 

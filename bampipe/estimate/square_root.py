@@ -74,7 +74,6 @@ class FilterSettings(NamedTuple):
         _V,
         _M,
     ),
-    cache=True,
     fastmath={"contract"},
 )
 def filter_square_root(  # type: ignore[no-untyped-def]

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.arrays import Array, Flags, Indices
+from bampipe.estimate.bounded import invert_scaled, solve_bounded
 from bampipe.estimate.propagation import Estimated
 from bampipe.estimate.square_root import (
     DONE,
@@ -48,14 +49,12 @@ class FilterFailure(ArithmeticError):
     """The filter lost the motion of a trial.
 
     Attributes:
-        trial: index of the trial; sample: index of the sample; reason: what happened.
+        sample: index of the sample; reason: what happened.
     """
 
-    def __init__(self, trial: int, sample: int, reason: str) -> None:
-        self.trial = trial
-        self.sample = sample
-        self.reason = reason
-        super().__init__(f"trial {trial}, sample {sample}: {reason}")
+    def __init__(self, sample: int, reason: str) -> None:
+        self.sample, self.reason = sample, reason
+        super().__init__(f"sample {sample}: {reason}")
 
 
 @dataclass(frozen=True)
@@ -224,23 +223,21 @@ def filter_trials(
     nx = model.n_states
 
     def filter_one(
-        index: int, trial: Trial, theta: Array, covariance: Array
+        trial: Trial, theta: Array, covariance: Array
     ) -> tuple[FilteredTrial, Array, Array]:
         mean = np.concatenate([trial.x, theta])
         try:
             root = join_roots(trial.x_sd, covariance)
-            filtered = run_kernel(model, settings, trial, mean, root)
-        except FilterFailure as failure:
-            raise FilterFailure(index, failure.sample, failure.reason) from None
         except ValueError as error:
-            raise FilterFailure(index, 0, _NOT_A_SPREAD) from error
+            raise FilterFailure(0, _NOT_A_SPREAD) from error
+        filtered = run_kernel(model, settings, trial, mean, root)
         return filtered, mean[nx:].copy(), (root @ root.T)[nx:, nx:]
 
     return in_sequence(filter_one, trials, np.clip(theta, *model.range), covariance)
 
 
 def in_sequence(
-    filter_one: Callable[[int, Trial, Array, Array], tuple[FilteredTrial, Array, Array]],
+    filter_one: Callable[[Trial, Array, Array], tuple[FilteredTrial, Array, Array]],
     trials: Sequence[Trial],
     theta: Array,
     covariance: Array,
@@ -248,14 +245,14 @@ def in_sequence(
     """Filter trials one after the other; each starts from the parameters of the one before.
 
     Args:
-        filter_one: filters one trial, given its number, the parameters (nt,) and their covariance
-            (nt, nt); returns the filtered trial, and parameters and covariance after it.
+        filter_one: filters one trial, given the parameters (nt,) and their covariance (nt, nt);
+            returns the filtered trial, and parameters and covariance after it.
         trials, theta, covariance: as in `filter_trials`.
     """
     theta, covariance = np.array(theta, dtype=float), np.array(covariance, dtype=float)
     found = []
-    for index, trial in enumerate(trials):
-        filtered, theta, covariance = filter_one(index, trial, theta, covariance)
+    for trial in trials:
+        filtered, theta, covariance = filter_one(trial, theta, covariance)
         found.append(filtered)
     return FilterOutcome(theta, covariance, tuple(found))
 
@@ -269,8 +266,7 @@ def run_kernel(
     are those at the first sample, and are overwritten with those at the last.
 
     Raises:
-        FilterFailure: the covariance lost positive definiteness or a number is not finite; the
-            trial has the number 0.
+        FilterFailure: the covariance lost positive definiteness or a number is not finite.
     """
     p, (observed, *sds, longest_step, stride) = _array(model.parameters), settings
     estimated = Estimated(
@@ -287,7 +283,7 @@ def run_kernel(
         *samples, mean, root,
     )  # fmt: skip
     if ended != DONE:
-        raise FilterFailure(0, sample, _REASONS[ended])
+        raise FilterFailure(sample, _REASONS[ended])
     return FilteredTrial(samples[0][:: int(stride)], *found)
 
 
@@ -296,20 +292,10 @@ def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
 
     Parameters outside are put on their bound; the others follow by the covariance (nt, nt).
     """
-    lower = np.where(model.logarithmic, model.range[0], model.lower)
-    upper = model.range[1]
-    held = np.zeros(theta.size, dtype=bool)
-    value = theta
-    for _ in range(theta.size):
-        outside = ~held & ((value < lower) | (value > upper))
-        if not outside.any():
-            break
-        held |= outside
-        shift = np.clip(theta, lower, upper)[held] - theta[held]
-        pull = np.linalg.lstsq(covariance[np.ix_(held, held)], shift, rcond=None)[0]
-        value = theta + covariance[:, held] @ pull
-        value[held] = np.clip(theta, lower, upper)[held]
-    return np.asarray(value)
+    lower, upper = np.where(model.logarithmic, model.range[0], model.lower), model.range[1]
+    precision, nothing = invert_scaled(covariance), np.zeros(theta.size)
+    change = solve_bounded(precision, nothing, lower - theta, upper - theta)
+    return np.asarray(np.clip(theta + change, lower, upper))
 
 
 def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:

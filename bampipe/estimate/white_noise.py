@@ -133,18 +133,15 @@ def _difference_noise(record: Array, t: Array | None, pulsed: bool = False) -> f
         if order < _LOWEST_ORDER:
             continue
         size = np.abs(differences) / np.sqrt(np.sum(weights**2, axis=0))
-        typical = _cut_rms(size) if pulsed else float(np.median(size)) / _NORMAL_MEDIAN
+        typical = float(np.median(size)) / _NORMAL_MEDIAN
+        if pulsed:
+            most = _CUT * float(np.quantile(size, 0.9))
+            typical = float(np.sqrt(np.mean(np.square(np.minimum(size, most)))))
         if typical == 0.0:  # more than half the differences are zero: coarse steps
             typical = float(np.sqrt(np.mean(np.square(size))))
         found.append(typical)
     agreed = (1.0 + _AGREE / np.sqrt(record.size)) * min(found)
     return float(next(noise for noise in found if noise <= agreed))
-
-
-def _cut_rms(size: Array) -> float:
-    """Return the root mean square of magnitudes (n,), clipped far beyond nine in ten of them."""
-    most = _CUT * float(np.quantile(size, 0.9))
-    return float(np.sqrt(np.mean(np.square(np.minimum(size, most)))))
 
 
 def _without_lines(record: Array, t: Array, lowest: float) -> Array:

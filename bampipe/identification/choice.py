@@ -104,15 +104,12 @@ def tabulate_methods(
     found = dict[Method, MethodTried]()
     for each in (published, *others):
         names = [system.parameters[place].name for place in each.free]
-        joint = 2.0 * np.hypot(each.sd, published.sd)
-        apart = np.abs(each.value - published.value) > joint
         found[each.method] = MethodTried(
             held_out_rmse=dict(zip(system.coordinates, each.held_out_rmse, strict=True)),
             parameters={
                 name: MethodValue(estimate=value, sd=sd)
                 for name, value, sd in zip(names, each.value, each.sd, strict=True)
             },
-            disagrees=tuple(name for name, far in zip(names, apart, strict=True) if far),
             doubts=each.doubts,
         )
     if lost:

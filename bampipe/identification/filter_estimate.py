@@ -12,12 +12,7 @@ from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.filter_uncertainty import choose_block, sandwich_covariance
 from bampipe.estimate.square_root import FilterSettings
-from bampipe.estimate.unscented import (
-    FilterFailure,
-    Trial,
-    constrain,
-    filter_trials,
-)
+from bampipe.estimate.unscented import FilterFailure, Trial, constrain, filter_trials
 from bampipe.identification.estimates import Estimate, input_timing
 from bampipe.identification.filter_run import (
     Attempt,
@@ -40,11 +35,10 @@ from bampipe.identification.filter_tables import (
 from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.identification.sensor_noise import (
     FilterChoice,
-    Noise,
     choose_tuning_trials,
+    force_noise_mask,
     noise_levels,
     tune_noise,
-    untuned_settings,
 )
 from bampipe.lists import join_names
 from bampipe.physics import System, compile_model
@@ -93,7 +87,7 @@ class Filtering:
         start: Array,
         squares: SquaresFit,
         sd: Array,
-        noise: Noise,
+        untuned: FilterSettings,
         choice: FilterChoice,
         report_progress: Progress,
     ) -> None:
@@ -104,22 +98,18 @@ class Filtering:
             start: (n_p,) initial values.
             squares: the least-squares fit, which gives the region of the answer.
             sd: (n,) its standard deviations, those of the prior for undetermined parameters.
+            untuned: settings with the noise of the sensors.
         """
         self.system, self.spec, self.name, self.start = system, spec, name, start
-        self.squares, self.sd, self.noise, self.report_progress = (
-            squares,
-            sd,
-            noise,
-            report_progress,
-        )
+        self.squares, self.sd, self.report_progress = squares, sd, report_progress
         motions: Sequence[Motion] = squares.trials.motions
         interval = float(np.median(np.diff(motions[0].t)))
         self.motions = part_trials(motions, 1.0 / interval)
-        sizes, stride = trial_sizes(self.motions), choose_stride(self.motions)
+        sizes = trial_sizes(self.motions)
+        self.untuned = untuned._replace(stride=choose_stride(self.motions))
         near, self.count = squares.p[:-1], sd.size
         self.trials: Sequence[Trial] = KeptItems(
-            load_filter_trial(run, motion, system, near, noise, stride, choice)
-            for motion in self.motions
+            load_filter_trial(run, motion, system, near, self.untuned) for motion in self.motions
         )
         timing = squares.free.size > self.count
         self.model = build_filter_model(system, self.trials, start, timing, squares.p[-1])
@@ -128,19 +118,17 @@ class Filtering:
         block_s = choose_block(seconds, self.model.free.size, choice.block_s)
         self.choice = replace(choice, block_s=block_s)
         report_progress(0.15, "noise levels")
-        settings = untuned_settings(system, noise, choice)
-        walk = np.append(settings.walk_sd, np.zeros(self.late_sd.size))
+        walk = np.append(untuned.walk_sd, np.zeros(self.late_sd.size))
         places, samples = choose_tuning_trials(sizes)
-        tuned = tune_noise(
-            settings._replace(walk_sd=walk),
+        self.settings = tune_noise(
+            self.untuned._replace(walk_sd=walk),
             self.model,
             [self.trials[place].first(samples) for place in places],
             [np.asarray(self.clear(place)[:samples].all(axis=1)) for place in places],
             (self.answer, self.known),
-            noise,
+            force_noise_mask(system),
             choice,
         )
-        self.settings = tuned._replace(stride=stride)
 
     def narrowed(self, factor: float) -> System:
         """The model with the widths of its smoothed signs multiplied by a factor."""
@@ -241,7 +229,7 @@ def estimate_by_filter(filtering: Filtering) -> Estimate:
     report = {
         "nis": nis,
         "innovations": check_innovations(system, found, filtering.clear),
-        "noise": noise_levels(system, found.settings, filtering.noise),
+        "noise": noise_levels(system, found.settings, filtering.untuned),
         "input_timing": input_timing(p, problem, scaled),
         "blocks": blocks,
         "restarts": found.restarts,

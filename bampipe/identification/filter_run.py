@@ -20,7 +20,7 @@ from bampipe.estimate.unscented import (
     Trial,
     filter_trials,
 )
-from bampipe.identification.sensor_noise import FilterChoice, Noise
+from bampipe.identification.sensor_noise import FilterChoice
 from bampipe.physics import System
 from bampipe.progress import Progress
 from bampipe.trials.motion import Motion, trial_sizes
@@ -139,21 +139,13 @@ def choose_stride(motions: Sequence[Motion]) -> int:
 
 
 def load_filter_trial(
-    run: RunFolder,
-    motion: Motion,
-    system: System,
-    p: Array,
-    noise: Noise,
-    stride: int,
-    choice: FilterChoice,
+    run: RunFolder, motion: Motion, system: System, p: Array, settings: FilterSettings
 ) -> Trial:
     """Read the raw samples of a trial, or of a part of it, for the filter.
 
     The state is that of the mechanism, which elements between it and the encoders may displace.
 
-    Args:
-        p: (n_p,) parameters near the answer, for the state at the first sample.
-        stride: samples from one stored distribution to the next.
+    ``p`` (n_p,) are parameters near the answer, for the state at the first sample.
     """
     columns = read_samples(run, motion.trial_id, system)
     t = columns["t"] - columns["t"][0]
@@ -163,22 +155,22 @@ def load_filter_trial(
             columns[name] = np.interp(t, motion.t, motion.inputs(system.inputs)[:, place])
     u = input_columns(columns, system.inputs, brakes)
     y = np.column_stack([columns[f"q_{axis}"] for axis in system.coordinates])
-    if choice.measure == "position_velocity":
+    n = len(system.coordinates)
+    if settings.observed.size > n:
         velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]
         y = np.hstack([y, np.stack(velocity, axis=1)])
     # The grid of the motion ends up to a sample before the time stamps.
     step = float(motion.t[-1] - motion.t[0]) / (len(motion.t) - 1)
     own = (t > motion.t[0] - 0.5 * step) & (t < motion.t[-1] + step)
     t, u, y = t[own], u[own], y[own]
-    n = len(system.coordinates)
     first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
     speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)
     true = motion.of_mechanism(system, motion.inputs(system.inputs), p)
     x, x_sd = infer_initial_state(
-        system, p, y[first, :n], true.qd[0], u[first], noise.reading_sd[:n], speed
+        system, p, y[first, :n], true.qd[0], u[first], settings.reading_sd[:n], speed
     )
     # The last stored distribution must be that of the last sample.
-    last = first + (t.size - 1 - first) // stride * stride + 1
+    last = first + (t.size - 1 - first) // settings.stride * settings.stride + 1
     t, u, y = t[first:last], u[first:last], y[first:last]
     curvature = np.zeros(u.shape)
     forced = list(system.forced)

@@ -15,7 +15,8 @@ from bampipe.estimate.identifiability import (
     weak_directions,
 )
 from bampipe.estimate.least_squares import Problem, residual_and_slopes
-from bampipe.identification.sensor_noise import Noise
+from bampipe.estimate.square_root import FilterSettings
+from bampipe.identification.sensor_noise import force_noise_mask
 from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.physics.structure import DeterminableNumber, structure
@@ -49,7 +50,7 @@ TIMING = "input_timing"
 
 
 def assess_identifiability(
-    system: System, motions: Sequence[Motion], problem: Problem, p: Array, noise: Noise
+    system: System, motions: Sequence[Motion], problem: Problem, p: Array, noise: FilterSettings
 ) -> tuple[IdentifiabilityReport, Array]:
     """Assess the uncertainty of the parameters due to sensor noise alone.
 
@@ -124,7 +125,7 @@ def find_information(
     problem: Problem,
     trial: int,
     p: Array,
-    noise: Noise,
+    noise: FilterSettings,
     further: Callable[..., Array] | None = None,
 ) -> Array:
     """Return the information of one trial on the estimated parameters, with sensor noise alone.
@@ -143,7 +144,7 @@ def find_information(
     if further is not None:
         slope = np.concatenate([slope, further(*motion.kinematics, z, u, own)], axis=2)
     slope *= ~problem.standstill[trial][:, :, None]
-    push = system.input_map(motion.q, u, own) * noise.process_sd[noise.is_force]
+    push = system.input_map(motion.q, u, own) * noise.noise_sd[force_noise_mask(system)]
     inertia = np.diagonal(system.mass_matrix(motion.q, own), axis1=1, axis2=2).mean(axis=0)
     known = {item.name: value for item, value in zip(system.parameters, own, strict=True)}
     damping = np.array([known.get(f"viscous.{axis}", 0.0) for axis in system.coordinates])

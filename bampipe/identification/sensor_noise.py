@@ -1,7 +1,6 @@
 """Settings of the filter, noise of the sensors, and tuning of noise levels by the likelihood."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -11,12 +10,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.arrays import Array, Flags
 from bampipe.estimate.filter_uncertainty import climb
 from bampipe.estimate.square_root import FilterSettings
-from bampipe.estimate.unscented import (
-    FilterFailure,
-    FilterModel,
-    Trial,
-    filter_trials,
-)
+from bampipe.estimate.unscented import FilterFailure, FilterModel, Trial, filter_trials
 from bampipe.physics import System
 from bampipe.results.identify import NoiseLevels
 from bampipe.schema import STRICT, NotNegative, Positive
@@ -62,25 +56,15 @@ class FilterChoice:
     trace_rows: Annotated[int, Field(gt=0)] = 2000
 
 
-@dataclass(frozen=True)
-class Noise:
-    """Noise of the sensors before tuning.
-
-    Attributes:
-        reading_sd: (ny,) of positions, and of velocities if they are measured.
-        process_sd: (nw,) of the model's process noise, per sample.
-        is_force: (nw,) which of these are a measured force.
-    """
-
-    reading_sd: Array
-    process_sd: Array
-    is_force: Flags
+def force_noise_mask(system: System) -> Flags:
+    """Find the components of the process noise that are a measured force, (nw,)."""
+    return np.array([name in system.inputs for name in system.noise], dtype=bool)
 
 
-def sensor_noise(
+def untuned_settings(
     sensors: Sensors, system: System, motions: Sequence[Motion], p: Array, choice: FilterChoice
-) -> Noise:
-    """Return the noise of the session's sensors, as the filter needs it.
+) -> FilterSettings:
+    """Return the settings of the filter with the noise of the session's sensors, before tuning.
 
     Process noise that is not of a force starts as the torque of the smallest force noise at an arm
     of 1 m. If the load moves the encoder relative to the handle, the noise of a force adds to the
@@ -88,52 +72,45 @@ def sensor_noise(
 
     ``p`` (n_p,) are parameters near the answer; ``choice`` may fix levels.
     """
-    reading = sensors.reading_sd.copy()
+    n, reading = len(system.coordinates), sensors.reading_sd.copy()
     if choice.reading_noise > 0.0:
         reading = choice.reading_noise * sensors.resolution
     if choice.measure == "position_velocity":
         velocity = np.concatenate([motion.qd_sd for motion in motions])
         reading = np.append(reading, np.median(velocity, axis=0))
     force_sd = dict(zip(system.model.device.forces, sensors.force_sd, strict=True))
-    is_force = np.array([name in system.inputs for name in system.noise])
+    is_force = force_noise_mask(system)
     process = np.array([float(force_sd.get(name, 0.0)) for name in system.noise])
     if choice.force_noise > 0.0:
         process[:] = choice.force_noise
     smallest = process[is_force].min() if is_force.any() else 0.05
     process[process == 0.0] = smallest or np.finfo(float).eps
-    noise = Noise(reading, process, is_force)
-    if not system.moves_sensors:
-        return noise
-    n = len(system.coordinates)
-    moved = _force_in_positions(system, motions, p, noise)
-    return replace(noise, reading_sd=np.append(np.hypot(reading[:n], moved), reading[n:]))
+    if system.moves_sensors:
+        reading[:n] = np.hypot(reading[:n], _force_in_positions(system, motions, p, process))
+    free = [item for item in system.parameters if not item.fixed]
+    return FilterSettings(
+        observed=np.arange(reading.size),
+        reading_sd=reading,
+        noise_sd=process,
+        walk_sd=choice.random_walk * np.array([item.sd for item in free]),
+        longest_step=choice.longest_step_s,
+    )
 
 
-def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noise: Noise) -> Array:
+def _force_in_positions(
+    system: System, motions: Sequence[Motion], p: Array, noise_sd: Array
+) -> Array:
     """Return the RMS motion of the encoders that force noise causes in the model, (n_q,)."""
     square, count = np.zeros(len(system.coordinates)), 0
     for motion in motions:
         given = motion.inputs(system.inputs)
         here = system.offset(motion.q, given, p)
-        for place in np.flatnonzero(noise.is_force):
+        for place in np.flatnonzero(force_noise_mask(system)):
             u = given.copy()
-            u[:, system.inputs.index(system.noise[place])] += noise.process_sd[place]
+            u[:, system.inputs.index(system.noise[place])] += noise_sd[place]
             square += np.sum((system.offset(motion.q, u, p) - here) ** 2, axis=0)
         count += len(motion.t)
     return np.asarray(np.sqrt(square / count))
-
-
-def untuned_settings(system: System, noise: Noise, choice: FilterChoice) -> FilterSettings:
-    """Return the settings of the filter with the noise of the sensors, before tuning."""
-    n = len(system.coordinates)
-    free = [item for item in system.parameters if not item.fixed]
-    return FilterSettings(
-        observed=np.arange(2 * n if choice.measure == "position_velocity" else n),
-        reading_sd=noise.reading_sd,
-        noise_sd=noise.process_sd,
-        walk_sd=choice.random_walk * np.array([item.sd for item in free]),
-        longest_step=choice.longest_step_s,
-    )
 
 
 def choose_tuning_trials(sizes: Sequence[int]) -> tuple[list[int], int]:
@@ -157,7 +134,7 @@ def tune_noise(
     records: Sequence[Trial],
     clear: Sequence[Flags],
     near: tuple[Array, Array],
-    noise: Noise,
+    is_force: Flags,
     choice: FilterChoice,
 ) -> FilterSettings:
     """Maximise the filter's likelihood over the noise levels, on parts of trials.
@@ -170,6 +147,7 @@ def tune_noise(
         settings: with the initial levels; records: the beginnings of trials.
         clear: (T,) by record, the samples at which no axis reverses; if there are none, all count.
         near: (nt,) parameters near the answer, physical, and (nt,) their sd.
+        is_force: see `force_noise_mask`.
         choice: may fix some levels.
     """
     longest = max(settings.longest_step, _TUNING_STEP_S)
@@ -194,22 +172,22 @@ def tune_noise(
         likely = np.concatenate([one.log_likelihood for one in found.trials])
         return float(np.nansum(likely[counts]))
 
-    count = noise.process_sd.size
+    count = is_force.size
     step = np.log(np.array([2.0**0.125, *np.full(count, 2.0)]))
-    lower = np.array([-np.inf, *np.where(noise.is_force, 0.0, np.log(1e-3))])
+    lower = np.array([-np.inf, *np.where(is_force, 0.0, np.log(1e-3))])
     if choice.reading_noise > 0.0:
         step[0] = 0.0
     if choice.force_noise > 0.0:
-        step[1:][noise.is_force] = 0.0
+        step[1:][is_force] = 0.0
     best, _ = climb(log_likelihood, np.zeros(count + 1), step, lower)
     return with_levels(best)._replace(longest_step=settings.longest_step, stride=settings.stride)
 
 
-def noise_levels(system: System, settings: FilterSettings, noise: Noise) -> NoiseLevels:
+def noise_levels(system: System, settings: FilterSettings, untuned: FilterSettings) -> NoiseLevels:
     """Return the tuned levels and those of the sensors, by name."""
     names = [*system.coordinates, *(f"{axis}_rate" for axis in system.coordinates)]
     return NoiseLevels(
         reading_sd=dict(zip(names, settings.reading_sd, strict=False)),
         process_sd=dict(zip(system.noise, settings.noise_sd, strict=True)),
-        sensor_sd=dict(zip(system.noise, noise.process_sd, strict=True)),
+        sensor_sd=dict(zip(system.noise, untuned.noise_sd, strict=True)),
     )

@@ -24,13 +24,11 @@ class Lab:
 
     Attributes:
         content: of ``trends.json``.
-        sessions: their names, in the order of recording.
         skipped: one line on each run folder that could not be read.
     """
 
     folder: Path
     content: TrendsResult
-    sessions: tuple[str, ...]
     skipped: tuple[str, ...]
 
 
@@ -93,4 +91,4 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         LabResult(
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
         ).write(folder)
-    return Lab(folder, content, sessions, tuple(skipped))
+    return Lab(folder, content, tuple(skipped))

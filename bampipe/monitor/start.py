@@ -15,12 +15,7 @@ from bampipe.declarations.model_file import load_model, read_estimate
 from bampipe.errors import InputError
 from bampipe.estimate.consistency import Reference, window_means
 from bampipe.estimate.square_root import FilterSettings
-from bampipe.estimate.unscented import (
-    FilterFailure,
-    FilterModel,
-    Trial,
-    filter_trials,
-)
+from bampipe.estimate.unscented import FilterFailure, FilterModel, Trial, filter_trials
 from bampipe.identification.filter_run import build_filter_model, infer_initial_state
 from bampipe.physics import System, compile_model
 from bampipe.results.identify import IdentifyResult

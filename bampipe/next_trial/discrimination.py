@@ -15,6 +15,7 @@ from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import compute_added_residual
 from bampipe.diagnosis.session import Fit, Session
+from bampipe.estimate.bounded import invert_scaled
 from bampipe.results.next import ExpectedConfusion, join_effects
 from bampipe.trials.folds import Folds
 from bampipe.trials.likelihood import Likelihood
@@ -308,10 +309,7 @@ class Comparison:
         columns = [*range(nb), *fitted]
         normal = squares[np.ix_(columns, columns)]
         normal[range(nb), range(nb)] += self._precision
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))[:, None]
-        moments = squares[np.ix_(columns, list(targets))]
-        solved = np.linalg.lstsq(normal * scale * scale.T, scale * moments, rcond=1e-9)[0]
-        return np.asarray(scale * solved)
+        return np.asarray(invert_scaled(normal) @ squares[np.ix_(columns, list(targets))])
 
     def weights(self) -> dict[tuple[int, int], float]:
         """Return Box-Hill weights (1967): the product of the odds of each pair, normalised."""

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array
+from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.least_squares import Problem, stacked_residual
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.square_root import FilterSettings
 from bampipe.identification.identifiability import find_information
-from bampipe.identification.sensor_noise import FilterChoice, Noise
+from bampipe.identification.sensor_noise import FilterChoice
 from bampipe.physics import System
 from bampipe.results.identify import IdentifyResult
 from bampipe.trials.motion import Motion
@@ -71,7 +73,7 @@ class Precision:
         band: Band,
         p: Array,
         identified: IdentifyResult,
-        noise: Noise,
+        noise: FilterSettings,
     ) -> Precision:
         """Return the precision that the trials at hand give.
 
@@ -110,7 +112,7 @@ class Precision:
         def known_by(of_motion: Callable[[Motion], Array]) -> tuple[Array, Array]:
             """Return the information of the trials at hand and the standard deviations it gives."""
             total = np.sum([of_motion(motion) for motion in motions], axis=0) + before
-            return np.asarray(total), np.sqrt(np.diag(_invert_scaled(total))[: len(names)])
+            return np.asarray(total), np.sqrt(np.diag(invert_scaled(total))[: len(names)])
 
         of_motion: Callable[[Motion], Array] = by_sensors
         total, formal = known_by(by_sensors)
@@ -170,7 +172,7 @@ class Precision:
 
     def _split_variance(self, information: Array) -> tuple[Array, Array]:
         """Return variances of the parameters, (n,), and the share of each that is due to trials."""
-        covariance, n = _invert_scaled(information), len(self.names)
+        covariance, n = invert_scaled(information), len(self.names)
         variance = np.diag(covariance)[:n]
         weighed = np.einsum("ij,j,ij->i", covariance, self.prior_precision, covariance)[:n]
         return variance, np.clip(1.0 - weighed / variance, 0.0, 1.0)
@@ -202,12 +204,7 @@ class Precision:
         n = len(self.names)
         # In units of the standard deviations, so that no determinant over- or underflows.
         before, after = (
-            np.linalg.slogdet(_invert_scaled(matrix)[:n, :n] / np.outer(self.sd, self.sd))[1]
+            np.linalg.slogdet(invert_scaled(matrix)[:n, :n] / np.outer(self.sd, self.sd))[1]
             for matrix in (self.information, self.information + added)
         )
         return float(0.5 * (before - after))
-
-
-def _invert_scaled(information: Array) -> Array:
-    scale = 1.0 / np.sqrt(np.diag(information))
-    return np.asarray(np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))

@@ -288,7 +288,7 @@ def compiled_function(
 
 
 def _compile(signature: str, options: str, name: str, arguments: str, body: Sequence[str]) -> str:
-    head = f"\n\n@njit({signature}, cache=True, error_model='numpy', {options})"
+    head = f"\n\n@njit({signature}, error_model='numpy', {options})"
     return f"{head}\ndef {name}({arguments}):\n    " + "\n    ".join(body) + "\n"
 
 

@@ -364,9 +364,9 @@ def _find_dependence(
             parameter makes it nonlinear; steps: named intermediates in the residual.
     """
     step_names, numbers = {name for name, _ in steps}, _collect_symbols(v for _, v in steps)
-    found = Dependence([], [], [], [], [], [])
+    found = Dependence([], [], [], [], [])
     p, varying = [*d.p.values()], {*d.p.values(), *d.z.values(), *d.changes.values()}
-    inputs, elsewhere = {*d.channel.values()}, _collect_symbols(beside)
+    elsewhere = _collect_symbols(beside)
     # A term has few of the model's parameters, and sympy is slow to find a slope zero.
     terms = [[(t, t.free_symbols) for t in sp.Add.make_args(e)] for e in residual]
     for i, symbol in enumerate(p):
@@ -385,7 +385,6 @@ def _find_dependence(
         lasts = constant and not bodily and slope_symbols.isdisjoint(step_names)
         found.linear.append(linear)
         found.constant.append(constant)
-        found.unforced.append(constant and slope_symbols.isdisjoint(inputs))
         found.lasting.append(by_axis if lasts else None)
         found.products.extend((j, i) for j in range(i) if p[j] in curving)
         if bodily and not by_axis:

@@ -14,8 +14,7 @@ class Dependence:
     Attributes:
         linear: whether it is linear in the parameter.
         products: pairs of parameters of which it has a product.
-        constant: whether its slope depends on no parameter and no internal state; unforced: and on
-            no input either.
+        constant: whether its slope depends on no parameter and no internal state.
         lasting: that slope by axis, None if it is not constant or involves `Equations.steps`.
         of_bodies: parameters that appear in those steps alone.
     """
@@ -23,7 +22,6 @@ class Dependence:
     linear: list[bool]
     products: list[tuple[int, int]]
     constant: list[bool]
-    unforced: list[bool]
     lasting: list[dict[int, Any] | None]
     of_bodies: list[int]
 

@@ -34,7 +34,7 @@ def between(q, qd, qdd, u, i, h, share, x, v, w):
 # Kutta-Merson steps (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, II.4).
 MEMORY_LOOP = '''
 
-@njit(types.float64(M, M, M, M, V, V, V, M), cache=True, error_model='numpy')
+@njit(types.float64(M, M, M, M, V, V, V, M), error_model='numpy')
 def memory(q, qd, qdd, u, p, t, z0, out):
     """Fourth-order steps along the samples of a motion, coupled ones as long as errors allow.
 
@@ -98,7 +98,7 @@ def memory(q, qd, qdd, u, p, t, z0, out):
 # two samples. Where more steps make a difference, as at a reversal, there are more.
 STIFF_MEMORY_LOOP = '''
 
-@njit(types.void(M, M, M, M, V, V, V, M), cache=True, error_model='numpy')
+@njit(types.void(M, M, M, M, V, V, V, M), error_model='numpy')
 def stiff_memory(q, qd, qdd, u, p, t, z0, out):
     """Exponential steps along the samples of a motion; fills out (T, n_z)."""
     n = len(z0)
@@ -131,7 +131,7 @@ def stiff_memory(q, qd, qdd, u, p, t, z0, out):
 # stable.
 LINEAR_MEMORY_LOOP = '''
 
-@njit(types.float64(M, M, M, M, V, V, V, M), cache=True, error_model='numpy')
+@njit(types.float64(M, M, M, M, V, V, V, M), error_model='numpy')
 def memory(q, qd, qdd, u, p, t, z0, out):
     """Exponential steps along the samples of a motion; fills out (T, n_z).
 

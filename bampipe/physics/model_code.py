@@ -35,7 +35,6 @@ def effects_code(model: Model) -> Generation:
         "linear": equations.dependence.linear,
         "products": equations.dependence.products,
         "constant": equations.dependence.constant,
-        "unforced": equations.dependence.unforced,
         "touched": [i for i, e in enumerate(added) if e != 0],
         "moves_sensors": any(e != 0 for e in equations.offset),
         "moved_by": [

@@ -41,7 +41,7 @@ class System:
         noise: names of the additive process noise w. changes: states whose rates `memory` appends.
         linear: per parameter, whether the residual is linear in it; of several, see `is_linear_in`.
         constant: per parameter, whether the slope of the residual by it depends on no parameter
-            along the mechanism's true motion; unforced: and on no input.
+            along the mechanism's true motion.
         touched: axes whose equation the effects change, measurement effects aside.
         moves_sensors: whether an effect of kind ``measurement`` is present.
         moved_by: numbers of the parameters of its `offset`.
@@ -74,7 +74,6 @@ class System:
         self.parameters: tuple[Parameter, ...] = model.parameters
         self.linear: tuple[bool, ...] = tuple(meta["linear"])
         self.constant: tuple[bool, ...] = tuple(meta["constant"])
-        self.unforced: tuple[bool, ...] = tuple(meta["unforced"])
         self._products: list[list[int]] = meta["products"]
         self.touched: tuple[int, ...] = tuple(meta["touched"])
         self.moves_sensors: bool = meta["moves_sensors"]

@@ -26,7 +26,6 @@ class AxisDifferentiation(Record):
     order: int | None = None
     """Order of the Kalman smoother's motion model"""
     resolution: Size
-    quantisation_sd: Size
     measurement_noise_sd: Size
     log_likelihood: dict[str, float] = Field(description="By order of the motion model")
     position_sd: Size

@@ -54,8 +54,6 @@ class MethodTried(Record):
     held_out_rmse: dict[str, Size] = Field(default={})
     """By axis, N.m or N; empty without parameters"""
     parameters: dict[str, MethodValue] = Field(default={}, description="By name")
-    disagrees: Names = ()
-    """Parameters that differ from the published ones by more than twice the uncertainty of both"""
     doubts: Names = Field(default=(), description="Reasons to distrust it")
 
 
@@ -129,8 +127,6 @@ class Consistency(Record):
 class InnovationTestResult(Record):
     """A test of the innovations: Ljung-Box, or F."""
 
-    statistic: float
-    degrees: int
     p_value: Share
     share: Share
 
@@ -167,7 +163,6 @@ class Convergence(Record):
     """Whether the search, or the filter along the data, converged."""
 
     converged: bool
-    iterations: Count | None = Field(default=None, description="Of least squares")
     settled_s: dict[str, Size] | None = None
     """Time after which each estimate stays within 2 % or 3 sd of its final value, s from the start
     of the first run"""

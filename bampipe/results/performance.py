@@ -41,8 +41,6 @@ class Handle(Record):
 
     directions: Names
     workspace: Quantity = Field(description="Swept in the session")
-    workspace_limits: Quantity | None = None
-    """Within the limits of the device file"""
     stiffness: Range | None = None
     friction: Range
     inertia: Range

@@ -19,7 +19,6 @@ class Damping(Record):
     """null if it is not recorded, as are the following"""
     p_value: Share | None = None
     differs: bool | None = None
-    felt_p_value: Share | None = None
     felt_differs: bool | None = None
     verdict: str | None = None
 
@@ -32,7 +31,5 @@ class ViscousResult(Result, file="models/{model}/viscous.json", stage="viscous")
     trials: Names
     blocks: Annotated[int, Field(ge=1)] | None = None
     """Number of stretches of time whose scatter gives the standard deviations"""
-    process_noise_factor: Annotated[float, Field(ge=1)] | None = None
-    """Factor on the filter's process noise that was needed; usually 1"""
     directions: dict[str, Damping]
     """By component of the handle's force; empty without viscous trials"""

@@ -13,17 +13,7 @@ from bampipe.files import digest_content, digest_file, digest_input, is_inside, 
 from bampipe.results.run import SESSION
 from bampipe.stages import base
 
-PACKAGES = (
-    "h5py",
-    "matplotlib",
-    "numba",
-    "numpy",
-    "pandas",
-    "pyarrow",
-    "scipy",
-    "sympy",
-    "typst",
-)
+PACKAGES = ("h5py", "matplotlib", "numba", "numpy", "pandas", "pyarrow", "scipy", "sympy", "typst")
 """Packages whose version may change a result."""
 
 SHARED_CODE = (

@@ -90,17 +90,16 @@ PRINTING = tuple(entry.name for entry in ENTRIES if entry.prints)
 AFTER = {entry.name: entry.after for entry in ENTRIES}
 
 
-def check_stage_name(name: str) -> None:
-    """Raise InputError unless there is a stage ``name``."""
-    if name in STAGES:
-        return
-    raise InputError(f"no stage {name!r}", remedy=choose_from(name, STAGES))
+def check_stage_name(name: str) -> str:
+    """Return ``name``; raise InputError unless there is such a stage."""
+    if name not in STAGES:
+        raise InputError(f"no stage {name!r}", remedy=choose_from(name, STAGES))
+    return name
 
 
 def load_stage(name: str) -> Stage:
     """Import and return the stage ``name``; InputError if there is none."""
-    check_stage_name(name)
-    return cast(Stage, importlib.import_module(f"bampipe.stages.{name}"))
+    return cast(Stage, importlib.import_module(f"bampipe.stages.{check_stage_name(name)}"))
 
 
 def paths_of(model: str, declared: tuple[str, ...]) -> tuple[str, ...]:

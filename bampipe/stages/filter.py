@@ -17,7 +17,7 @@ from bampipe.data.run_folder import FILTERED, INGESTED, MOVING, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
-from bampipe.estimate import butterworth, kalman_smoother
+from bampipe.estimate import kalman_smoother
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.white_noise import white_noise_sd
@@ -77,9 +77,8 @@ class Config:
             central differences), or ``auto``, which is the Kalman smoother: it alone bridges
             gaps with honest error bands and has its bandwidth set by the likelihood of the
             samples.
-        cutoff_hz: bandwidth, Hz, for all axes; 0 takes it from the data, axis by axis: for the
-            Kalman smoother the maximum likelihood over order and process noise, for the other
-            the frequency where the encoder spectrum meets the quantisation floor.
+        cutoff_hz: bandwidth, Hz, for all axes; 0 takes it from the data, axis by axis: the maximum
+            likelihood over order and process noise of the Kalman smoother.
         minimum_bandwidth_hz: a bandwidth taken from the data is held at this or above, Hz:
             changes of direction must not be smeared, friction is read from them.
         force_cutoff_hz: half-amplitude frequency, Hz, of the derivatives of the force; the force
@@ -406,21 +405,20 @@ def _choose(
         )
         for order in kalman_smoother.ORDERS
     }
-    fits = {k: found for k, found in fits.items() if np.isfinite(found.log_likelihood)}
+    fits = {k: found for k, found in fits.items() if np.isfinite(found[1])}
     if not fits:
         raise InputError(
             f"no filter can follow the motion of {axis}",
             where=f"encoders.{axis}",
             remedy="check that this is the column of its position, in the right unit",
         )
-    order = max(fits, key=lambda k: fits[k].log_likelihood)
-    best = fits[order].model
+    order = max(fits, key=lambda k: fits[k][1])
+    best, _ = fits[order]
     noise_sd = best.noise_sd
-    floor = float(np.median([butterworth.floor_frequency(x, rate, noise_sd) for x, _ in records]))
     most = 0.2 * rate
     least = min(config.minimum_bandwidth_hz, most)
     kalman = config.method in ("auto", "kalman")
-    found = best.bandwidth_hz if kalman else floor
+    found = best.bandwidth_hz
     cutoff = config.cutoff_hz or float(np.clip(found, least, most))
     if cutoff >= 0.5 * rate:
         raise InputError(
@@ -433,18 +431,15 @@ def _choose(
         why = f"the data suggest {found:.1f} Hz; limited to the minimum bandwidth"
     elif found > most:
         why = f"the data suggest {found:.1f} Hz; limited to a fifth of the sampling rate"
-    elif kalman:
-        why = "maximum likelihood of the encoder samples"
     else:
-        why = "encoder spectrum meets the quantisation floor"
+        why = "maximum likelihood of the encoder samples"
     report: dict[str, Any] = {
         "bandwidth_hz": cutoff,
         "bandwidth_reason": why,
         "order": order if kalman else None,
         "measurement_noise_sd": noise_sd,
-        "quantisation_sd": resolution / float(np.sqrt(12.0)),
         "resolution": resolution,
-        "log_likelihood": {str(k): f.log_likelihood for k, f in fits.items()},
+        "log_likelihood": {str(k): likely for k, (_, likely) in fits.items()},
     }
     return AxisFilter(cutoff, noise_sd, order if kalman else 0), report
 

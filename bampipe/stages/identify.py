@@ -15,6 +15,7 @@ from bampipe.declarations.model import read_model_file
 from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_spec
 from bampipe.diagnosis.start import SignWidth, choose_sign_width, search_start
 from bampipe.errors import InputError
+from bampipe.estimate.square_root import FilterSettings
 from bampipe.identification.bodies import base_estimates, make_possible, summarise_bases
 from bampipe.identification.calibration import (
     describe_calibration,
@@ -38,7 +39,7 @@ from bampipe.identification.least_squares_estimate import (
     fit_squares,
     require_enough,
 )
-from bampipe.identification.sensor_noise import FilterChoice, Noise, sensor_noise
+from bampipe.identification.sensor_noise import FilterChoice, untuned_settings
 from bampipe.physics import System, compile_model
 from bampipe.physics.model_spec import ModelSpec
 from bampipe.progress import Progress
@@ -121,7 +122,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     fitted, held = _fit(task, start)
     squares, notes = make_possible(system, fitted)
     motions = squares.trials.motions
-    noise = sensor_noise(squares.trials.sensors, system, motions, squares.p[:-1], config)
+    noise = untuned_settings(squares.trials.sensors, system, motions, squares.p[:-1], config)
     identifiability, unseen = assess_identifiability(
         system, motions, squares.problem, squares.p, noise
     )
@@ -238,7 +239,7 @@ def _filter(
     squares: SquaresFit,
     by_squares: Estimate,
     start: Array,
-    noise: Noise,
+    noise: FilterSettings,
     progress: Progress,
 ) -> tuple[Estimate | None, str]:
     """Return the filter's estimate if requested; otherwise the reason, "" if none is due."""

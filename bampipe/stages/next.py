@@ -22,7 +22,7 @@ from bampipe.diagnosis.session import Session, change_effects, system_of
 from bampipe.errors import InputError, NothingToDoError, choose_from
 from bampipe.estimate.simulation import Runaway
 from bampipe.files import digest_content, write_json, write_text
-from bampipe.identification.sensor_noise import FilterChoice, sensor_noise
+from bampipe.identification.sensor_noise import FilterChoice, untuned_settings
 from bampipe.next_trial.discrimination import Comparison
 from bampipe.next_trial.forecast import Forecast
 from bampipe.next_trial.plan import Goal, plan_trials, record_plan
@@ -213,7 +213,7 @@ def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Prog
     if asked == "sensitivity":
         progress(0.1, "smallest strength of each effect that these trials would show")
         detectability = _find_detectability(case)
-    noise = sensor_noise(trials.sensors, case.system, case.fitted, case.p, FilterChoice())
+    noise = untuned_settings(trials.sensors, case.system, case.fitted, case.p, FilterChoice())
     precision = Precision.of_trials(
         case.system, case.fitted, trials.band, case.p, case.identified, noise
     )

@@ -92,7 +92,6 @@ def _handle(run: RunFolder, system: System, p: Array, reach: Array, points: int)
     1 / (B^T M^-1 B)_jj.
     """
     device, axes = system.model.device, system.coordinates
-    limits = [device.limits.get(axis) for axis in axes]
     grid = _grid(reach, points)
     no_input = np.zeros((len(grid), len(system.inputs)))
     gain = system.input_map(grid, no_input, p)
@@ -105,10 +104,6 @@ def _handle(run: RunFolder, system: System, p: Array, reach: Array, points: int)
         )
     back = np.linalg.inv(gain[regular])
     swept = "m" if len(axes) == 1 else f"m{len(axes)}"
-    within = None
-    if None not in limits:
-        volume = _volume(system, np.array(limits, dtype=float), p, points)
-        within = Quantity(value=volume, unit=swept)
     known = {item.name: value for item, value in zip(system.parameters, p, strict=True)}
     coulomb = np.array([known.get(f"coulomb.{axis}", 0.0) for axis in axes])
     compliance = np.linalg.inv(system.mass_matrix(grid[regular], p))
@@ -121,7 +116,6 @@ def _handle(run: RunFolder, system: System, p: Array, reach: Array, points: int)
     return Handle(
         directions=device.components,
         workspace=Quantity(value=_volume(system, reach, p, points), unit=swept),
-        workspace_limits=within,
         friction=_range(np.abs(back) @ coulomb, "N"),
         inertia=_range(1.0 / np.diagonal(mobility, axis1=1, axis2=2), "kg"),
         stiffness=felt,

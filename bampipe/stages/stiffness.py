@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from pydantic.dataclasses import dataclass as checked_dataclass
+from scipy.stats import linregress
 
 from bampipe.arrays import Array
 from bampipe.data.run_folder import INGESTED, RunFolder
@@ -246,8 +247,8 @@ def _find_calibration_shares(
     for name, change in calibration_changes(signals):
         moved = change.of_motion(motion, signals)
         theirs = _applied(system, moved.q, moved.inputs(system.inputs), moved.t)[:, number]
-        torques, deflections = _slope(theirs, torque), _slope(moved.q[:, number], deflection)
-        shares[name] = torques / deflections - 1.0
+        torques = linregress(torque, theirs).slope
+        shares[name] = torques / linregress(deflection, moved.q[:, number]).slope - 1.0
     return shares
 
 
@@ -255,12 +256,6 @@ def _applied(system: System, q: Array, u: Array, t: Array) -> Array:
     """Generalised force (T, n_q) of inputs u (T, n_u) on a device at rest in poses q (T, n_q)."""
     still, p = np.zeros_like(q), system.prior
     return system.applied(q, still, still, system.memory(q, still, still, u, p, t), u, p)
-
-
-def _slope(values: Array, against: Array) -> float:
-    """Return the slope of the straight line through ``values`` (T,) over ``against`` (T,)."""
-    centred = against - against.mean()
-    return float(values @ centred / (centred @ centred))
 
 
 def _axis(
@@ -324,9 +319,7 @@ def _axis(
         yielded=all(trial.found.yielded for trial in trials),
         cycles=tuple(
             LoopCycle.of(
-                cycle,
-                trial_id=trial.trial_id,
-                duration_s=(cycle.stop - cycle.start) / trial.rate,
+                cycle, trial_id=trial.trial_id, duration_s=(cycle.stop - cycle.start) / trial.rate
             )
             for trial, cycle in cycles
         ),

@@ -19,7 +19,7 @@ from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.identification import filter_run
 from bampipe.identification.filter_tables import tabulate_trace
-from bampipe.identification.sensor_noise import FilterChoice, sensor_noise, untuned_settings
+from bampipe.identification.sensor_noise import FilterChoice, untuned_settings
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.viscous_field import NAME as FIELD
 from bampipe.physics.viscous_field import viscous_field
@@ -106,17 +106,15 @@ def _estimated(
     known, start = identified.parameters, system.prior
     for i, item in enumerate(system.parameters):
         start[i] = known[item.name].estimate if item.name in known else start[i]
-    noise = sensor_noise(read_sensors(run, system), system, motions, start, config)
-    settings = untuned_settings(system, noise, config)
+    settings = untuned_settings(read_sensors(run, system), system, motions, start, config)
+    settings = settings._replace(stride=filter_run.choose_stride(motions))
     if identified.noise is not None and config.force_noise == 0.0:
         found_sd = [identified.noise.process_sd[name] for name in system.noise]
         settings = settings._replace(noise_sd=np.array(found_sd))
-    stride = filter_run.choose_stride(motions)
-    settings = settings._replace(stride=stride)
     brakes = [name in system.model.device.brakes.values() for name in system.inputs]
     readings = []
     for motion in motions:
-        trial = filter_run.load_filter_trial(run, motion, system, start, noise, stride, config)
+        trial = filter_run.load_filter_trial(run, motion, system, start, settings)
         readings.append(replace(trial, u=np.where(brakes, 0.0, trial.u)))
     free = [item for item in system.parameters if not item.fixed]
     late_s = identified.input_timing.estimate
@@ -157,7 +155,6 @@ def _estimated(
         trials=tuple(motion.trial_id for motion in motions),
         directions=directions,
         blocks=blocks,
-        process_noise_factor=attempts[found.restarts][2],
         headline="; ".join(
             f"{name} {round_with_sd(entry.estimate, entry.sd)} N.s/m"
             + ("" if command is None else f" ({entry.verdict})")
@@ -222,7 +219,6 @@ def _direction(
         commanded=command,
         p_value=p,
         differs=differs,
-        felt_p_value=felt_p,
         felt_differs=felt_p < _SIGNIFICANT,
         verdict=f"{what} from the commanded {command:.4g}, p = {p:.2g}",
     )

@@ -74,7 +74,8 @@ class Kinematics:
         """Motion that a signal (T,) adds if it is added to the readings; see `differentiate`."""
         name = list(self.axes)[axis]
         if self.method == "kalman":
-            return kalman_smoother.smooth_mean(signal, self._motion_model(name))
+            found = self.differentiate(name, signal)
+            return found.position, found.velocity, found.acceleration
         return butterworth.zero_phase(signal, self.rate_hz, self.axes[name].bandwidth_hz)
 
     def _motion_model(self, axis: str) -> kalman_smoother.MotionModel:

@@ -9,13 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from bampipe.arrays import Array, Flags
-from bampipe.estimate.least_squares import (
-    KnownSlopes,
-    Problem,
-    as_measured,
-    minimise,
-    stacked_residual,
-)
+from bampipe.estimate.least_squares import Problem, as_measured, minimise, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.physics import System
@@ -203,25 +197,21 @@ def linearise_fit(
 ) -> Linearisation:
     """Fit a model to the fitted trials, from parameters (n_p,), and linearise it on all trials.
 
-    ``like`` is a fitted model with more or fewer effects, whose slopes are reused where both agree;
+    ``like`` is a linearisation on the same trials, which shares them as it has joined them;
     ``timing`` limits the change of the input delay, s.
 
     Raises:
         ValueError: fewer samples than parameters, if a fit is requested.
     """
-    if like is not None and (like.motions is not motions or like.band != band):
-        like = None
-    joined = like.joined if like is not None else join_short(motions)
+    shared = like is not None and like.motions is motions
+    joined = like.joined if like is not None and shared else join_short(motions)
     # Without a fit, all trials can be linearised at once.
     taken, fitted = (motions, folds.fitted_trials) if most_iterations else (joined, [0])
     problem = problem_of(system, taken, band)
-    known = None if like is None else _common_slopes(like, system, problem)
-    found = minimise(
-        problem, np.append(start, 0.0), fitted, most_iterations, known=known, tolerance=_CONVERGED
-    )
+    found = minimise(problem, np.append(start, 0.0), fitted, most_iterations, tolerance=_CONVERGED)
     place = {trial: number for number, trial in enumerate(fitted)}
     stacked = (
-        found.stacked[place[k]] if k in place else stacked_residual(problem, k, found.p, known)
+        found.stacked[place[k]] if k in place else stacked_residual(problem, k, found.p)
         for k in range(len(taken))
     )
     value, residual, used = found.p[problem.free], list[Array](), list[Flags]()
@@ -255,33 +245,3 @@ def _factors(problem: Problem, p: Array, axes: int) -> tuple[float, ...]:
 
 def _on_each(system: System, p: Array, motions: Sequence[Motion]) -> tuple[ModelOnTrial, ...]:
     return tuple(ModelOnTrial(system, p, motions, k) for k in range(len(motions)))
-
-
-def _common_slopes(like: Linearisation, system: System, problem: Problem) -> KnownSlopes | None:
-    """The slopes by shared parameters that are the same in both models.
-
-    A slope that depends on no parameter is the same with and without any effect. None are shared if
-    standstill differs between the models, as it does if only one of them reads a brake.
-    """
-    brakes = {*system.model.device.brakes.values()}
-    if brakes & {*system.inputs} != brakes & {*like.system.inputs}:
-        return None
-    held = {like.system.parameters[i].name: k for k, i in enumerate(like.free)}
-    constant = like.system.constant
-    moved = like.system.moves_sensors
-    source = [held.get(system.parameters[i].name, -1) for i in problem.free]
-    holds = [
-        k >= 0 and not moved and constant[like.free[k]] and bool(here)
-        for k, here in zip(source, problem.constant, strict=True)
-    ]
-    places = np.flatnonzero(holds)
-    taken = [source[k] for k in places]
-    joined = problem.n_trials < len(like.jacobian)
-
-    def take_columns(trial: int) -> Array:
-        jacobian = np.concatenate(like.jacobian) if joined else like.jacobian[trial]
-        columns = np.zeros((*jacobian.shape[:2], problem.free.size))
-        columns[:, :, places] = jacobian[:, :, taken]
-        return columns
-
-    return KnownSlopes(take_columns, np.array(holds))

@@ -64,14 +64,13 @@ def problem_of(
         at, u, z = motion.kinematics, motion.inputs(system.inputs), motion.memory(system, p[:n])
         return system.residual(*at, z, u, p[:n], forces)
 
-    def slopes(trial: int, p: Array, wanted: Sequence[int]) -> tuple[list[int], Array]:
-        numbers = [free[k] for k in wanted]
-        given = [k for k, i in enumerate(numbers) if i in system.lasting]
+    def slopes(trial: int, p: Array) -> tuple[list[int], Array]:
+        given = [k for k, i in enumerate(free) if i in system.lasting]
         if not given:
             return given, np.empty((len(motions[trial].q), len(system.coordinates), 0))
         motion = move(trial, float(p[n]), tuple(p[by_offset]))
         u = motion.inputs(system.inputs)
-        return given, system.slopes([numbers[k] for k in given], *motion.kinematics, u)
+        return given, system.slopes([free[k] for k in given], *motion.kinematics, u)
 
     parameters = system.parameters
     free = [i for i, item in enumerate(parameters) if not item.fixed and item.name not in held]
@@ -88,19 +87,13 @@ def problem_of(
     ]
     known = [parameters[i].prior for i in free]
     precision = [1.0 / parameters[i].sd ** 2 if parameters[i].weighed else 0.0 for i in free]
-    # Slopes that contain an input change when the inputs are shifted in time.
-    constant = system.unforced if timing else system.constant
-    same = [constant[i] and not system.moves_sensors for i in free]
     multiplied = _multiplied(system, free)
-    if multiplied is not None:  # these slopes depend on the residual, see `as_measured`
-        same = [constant and axis < 0 for constant, axis in zip(same, multiplied, strict=True)]
     linear = system.is_linear_in(free)
     if timing:
         half = 0.5 / band.rate_hz
         # A model that is linearised once needs the secant over the whole range; one that is
         # linearised repeatedly needs the tangent, or its descent stops short of the minimum.
         apart = half if linear else 0.05 * half
-        same = [*same, False]
         precision, known = [*precision, 0.0], [*known, 0.0]
         free, lower, upper, step = [*free, n], [*lower, -half], [*upper, half], [*step, apart]
         multiplied = None if multiplied is None else np.append(multiplied, -1)
@@ -112,7 +105,6 @@ def problem_of(
         upper=np.array(upper),
         step=np.array(step),
         linear=linear,
-        constant=np.array(same),
         band=band,
         standstill=KeptItems(map(left_out, range(len(motions)))),
         precision=np.array(precision),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from physics.small_arm import ARM
 from scipy.signal import butter, sosfiltfilt
-from sessions import BAND, KINEMATICS, RATE, bam, fit_trials, folds, made
+from sessions import BAND, KINEMATICS, RATE, bam, folds
 
 from bampipe.diagnosis.session import system_of
-from bampipe.estimate.least_squares import residual_and_slopes, stacked_residual
+from bampipe.estimate.least_squares import residual_and_slopes
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model
 from bampipe.physics.device import LAST_ORDER, derivative
@@ -32,45 +32,6 @@ def test_thinning_is_that_of_the_library_with_a_cut_off_an_axis():
         alone = butter(2, cutoff, fs=RATE, output="sos")
         expected = sosfiltfilt(alone, values[:, column])[rows]
         assert np.allclose(both[60:-60, column], expected[60:-60], atol=1e-6)
-
-
-def test_slopes_are_those_of_the_last_parameters_after_a_nonlinear_fit():
-    """Slopes that no parameter changes are carried from one iteration to the next."""
-    spec = bam(["presliding:yaw"])
-    session = made(spec, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=2)
-    system, found = system_of(spec), fit_trials(session, spec)
-    assert np.abs(found.p - system.prior).max() > 0.2
-    anew = linearise_fit(system, session.motions, BAND, found.p, session.folds, most_iterations=0)
-    for carried, fresh in zip(found.jacobian, anew.jacobian, strict=True):
-        np.testing.assert_allclose(carried, fresh, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("timing", [False, True])
-def test_slopes_that_are_called_constant_are_the_same_at_other_parameters(timing):
-    """With the inputs moved in time, too, where their timing is estimated."""
-    spec = bam(["presliding:yaw", "force_gain:x"])
-    session = made(spec, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=1)
-    system = system_of(spec)
-    problem = problem_of(system, session.motions, BAND, timing=timing)
-    here, there = np.append(system.prior, 0.0), np.append(1.3 * system.prior, 0.0)
-    there[-1] = 0.4 / RATE if timing else 0.0
-    slopes = [stacked_residual(problem, 0, p).slope for p in (here, there)]
-    assert problem.constant.any() and not problem.constant.all()
-    for k in np.flatnonzero(problem.constant):
-        scale = np.abs(slopes[0][:, :, k]).max()
-        np.testing.assert_allclose(slopes[0][:, :, k], slopes[1][:, :, k], atol=1e-7 * scale)
-
-
-@pytest.mark.parametrize("effects", [["stribeck:yaw"], ["brake_lag"], ["encoder_scale:yaw"]])
-def test_a_fit_that_takes_slopes_from_a_model_like_it_is_the_same(effects):
-    session = made(bam(), {}, trials=2)
-    narrow, wide = system_of(bam()), system_of(bam(effects))
-    fits = [fit_trials(session, spec) for spec in (bam(effects), bam())]
-    for system, alone, like in zip((wide, narrow), fits, fits[::-1], strict=True):
-        given = system, session.motions, BAND, system.prior, session.folds
-        found = linearise_fit(*given, like=like)
-        for one, two in zip(found.jacobian, alone.jacobian, strict=True):
-            np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-7 * np.abs(two).max())
 
 
 def test_standstill_is_left_out_and_quick_reversals_stay():

@@ -44,7 +44,6 @@ def problem(count: int = 3, truth: np.ndarray = TRUTH, **changes: object) -> Pro
         "upper": BOUNDS[1],
         "step": np.ones(3),
         "linear": True,
-        "constant": np.zeros(3, dtype=bool),
         "band": Band(RATE, (8.0,)),
         "standstill": [np.zeros((len(m[0]), 1), dtype=bool) for m in motions],
     } | changes
@@ -118,7 +117,6 @@ def test_a_scale_that_is_free_does_not_collapse(start: float) -> None:
     scaled = {
         "residual": residual, "free": np.arange(4), "step": np.ones(4), "known": known,
         "precision": precision, "lower": np.zeros(4), "upper": np.full(4, np.inf),
-        "constant": np.zeros(4, dtype=bool),
     }  # fmt: skip
     free = problem(multiplied=np.array([-1, -1, -1, 0]), **scaled)
     found = minimise(free, np.append(TRUTH, start))

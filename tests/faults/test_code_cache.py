@@ -24,7 +24,7 @@ CALLED = """
 from numba import float64
 from bampipe.compiled import njit
 
-@njit(float64(float64), cache=True)
+@njit(float64(float64))
 def inner(x):
     return {factor} * x
 """
@@ -33,7 +33,7 @@ from numba import float64
 from bampipe.compiled import njit
 from inner_of_test import inner
 
-@njit(float64(float64), cache=True)
+@njit(float64(float64))
 def outer(x):
     return inner(x) + 1.0
 """

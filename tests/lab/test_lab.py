@@ -197,7 +197,7 @@ def test_sessions_without_a_date_come_first_and_a_damaged_run_is_named(tmp_path:
     Made("undated", None, estimates(4)).write(runs)
     (runs / "s02" / "models/base/identify.json").write_text("{")
     found = collect(runs, tmp_path / "lab", report=False)
-    assert found.sessions == ("undated", "s01", "s03")
+    assert [one.session for one in found.content.sessions] == ["undated", "s01", "s03"]
     assert len(found.skipped) == 1
     assert re.match(r"s02: .*identify\.json, line 1: not JSON", found.skipped[0])
 
@@ -218,7 +218,7 @@ def test_a_result_of_another_form_leaves_its_run_out(
     runs = make_lab(tmp_path, sessions=2)
     (runs / "s01" / name).write_text(json.dumps(content))
     found = collect(runs, tmp_path / "lab", report=False)
-    assert found.sessions == ("s02",)
+    assert [one.session for one in found.content.sessions] == ["s02"]
     (skipped,) = found.skipped
     assert skipped.startswith("s01: ") and "\n" not in skipped
 

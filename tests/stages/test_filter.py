@@ -90,7 +90,7 @@ def test_motion_is_recovered(run: RunFolder, method: str) -> None:
         assert np.std(rows["force_rate_x"] - truth["force_rate_x"]) < 2.0
     for axis, entry in content["axes"].items():
         assert 20.0 <= entry["bandwidth_hz"] <= 100.0, axis
-        assert entry["measurement_noise_sd"] >= 0.999 * entry["quantisation_sd"]
+        assert entry["measurement_noise_sd"] >= 0.999 * entry["resolution"] / np.sqrt(12.0)
 
 
 def test_columns_and_bands_and_a_force_that_is_not_filtered(run: RunFolder) -> None:
