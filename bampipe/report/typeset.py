@@ -26,7 +26,7 @@ from bampipe.report.document import (
 _TEMPLATE = Path(__file__).parent / "templates" / "report.typ"
 _NORMAL_SIZE, _SMALL_SIZE = 9.0, 8.0
 _MANY_COLUMNS = 7
-_MANY_ROWS, _MANY_LETTERS = 8, 1500
+_MANY_ROWS, _MANY_LETTERS = 14, 1500
 """Size beyond which a table may continue on the next page."""
 _BEFORE_UNIT = re.compile(r" (?=%)|(?<=\d) (?=[kmµ]?(?:N|m|rad|s|g|Hz)\b)")
 _VERBATIM = ("name", "tone", "lines", "columns")

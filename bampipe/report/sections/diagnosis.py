@@ -65,7 +65,7 @@ def _show_model(
             )
         yield phrases.null_distribution(found.chance)
     yield _advise(results, found) if lacking else _tell_sensitivity(results, model)
-    if found.suggested_trial is not None:
+    if found.suggested_trial is not None and results.read(NextResult, model) is None:
         yield Callout("note", "A trial that would tell more", found.suggested_trial.sentence)
     for axis in lacking:
         if maps := found.maps.get(axis):
@@ -105,6 +105,8 @@ def _advise(results: Results, found: DiagnoseResult) -> str:
             return f"Added since, as model `{rung.model}`."
     if found.next.startswith("bampipe draft ") and results.read(DraftResult, found.model):
         return "Drafted since (under Drafts)."
+    if found.next.startswith("bampipe next ") and results.read(NextResult, found.model):
+        return f"The trial to record is under {next_trial.TITLE}."
     return results.state_next(found.next)
 
 
@@ -167,7 +169,8 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
         " with its confidence band against its possible causes. Where the band excludes zero,"
         " the model lacks something."
     )
-    return style.finish(figure, f"residual-maps-{model}-{axis}", caption, panels[:1])
+    name = f"residual-maps-{model}-{axis}"
+    return style.finish(figure, name, caption, panels[:1] if later else ())
 
 
 def draw_maps(panel: Any, name: str, shown: Sequence[tuple[ResidualMap, str, str]]) -> None:

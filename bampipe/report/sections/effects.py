@@ -59,7 +59,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
         for one in (diagnosis.ranking if diagnosis else ())
         if one.effect not in added and (text := texts.get(one.effect.partition(":")[0]))
     ][:_MOST_CANDIDATES]
-    title = f"Weighed on model `{diagnosis.model if diagnosis else ''}`, best first"
+    title = f"Effects weighed on model `{diagnosis.model if diagnosis else ''}`, best first"
     yield tabulate_candidates(title, rows, "Description and formula ~2.6")
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
+from bampipe.phrases.proposal import say_chance
 from bampipe.report.document import Block, Callout, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits
@@ -52,8 +53,11 @@ def tabulate_confusion(
     title: str, heads: tuple[str, str], pairs: Sequence[PlannedConfusion]
 ) -> Table:
     """Tabulate the probability of confusing two effects, without and with new trials."""
-    rows = [(" or ".join(f"`{n}`" for n in p.between), p.before, p.after) for p in pairs]
-    return Table(title, f"Effects | >{heads[0]} :% | >{heads[1]} :%", rows)
+    rows = [
+        (" or ".join(f"`{n}`" for n in p.between), say_chance(p.before), say_chance(p.after))
+        for p in pairs
+    ]
+    return Table(title, f"Effects | >{heads[0]} | >{heads[1]}", rows)
 
 
 def tabulate_sds(title: str, entries: Mapping[str, ExpectedSd]) -> Table:

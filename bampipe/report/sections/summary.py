@@ -78,8 +78,9 @@ def _describe_session(results: Results) -> str:
             f"{METHODS[identified.method]}."
         )
     if validated := results.read(ValidateResult):
-        where = "held-out" if any(t.held_out for t in validated.trials.values()) else "the same"
-        parts.append(f"The predicted force was compared with the measured one on {where} trials.")
+        is_held_out = any(t.held_out for t in validated.trials.values())
+        where = "held-out data" if is_held_out else "the same trials"
+        parts.append(f"The predicted force was compared with the measured one on {where}.")
     return " ".join(parts)
 
 
