@@ -195,7 +195,7 @@ def _tabulate_charts(charts: list[ControlChart]) -> Table:
         "Between: scatter between sessions, without the uncertainty within them. Within: median "
         "standard deviation of a session's estimate. Trend: median slope (Theil and Sen), and the "
         "probability of so clear a trend by chance (Kendall).",
-    )
+    ).drop_empty_columns()
 
 
 def _show_errors(folder: Path, trends: TrendsResult) -> Iterator[Section]:

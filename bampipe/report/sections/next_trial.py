@@ -21,13 +21,16 @@ def list_blocks(results: Results) -> Iterator[Block]:
         return
     yield Callout("note", "The next trial", found.sentence)
     yield f"{found.why} {found.expected}"
+    best, inertial = found.proposals[0], set[str]()
     if identified := results.read(IdentifyResult):
+        inertial = {*identified.inertial}
         forecasts = read_forecasts(results.root, results.model)
         lines = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
         yield tuple(one.replace("RUN", results.root.name) for one in lines)
-    best, heads = found.proposals[0], ("with the present trials", "with the next one")
+    heads = ("with the present trials", "with the next one")
     yield tabulate_confusion("Probability of confusing two effects", heads, best.confusion)
-    yield tabulate_sds("Standard deviation of each parameter, now and with the next trial", best.sd)
+    sds = {name: sd for name, sd in best.sd.items() if name not in inertial}
+    yield tabulate_sds("Standard deviation of each parameter, now and with the next trial", sds)
 
     def factor(pair: tuple[str, Detectable]) -> float:
         return float("inf") if pair[1].smallest is None else pair[1].smallest / pair[1].typical

@@ -22,8 +22,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
     if found is None:
         return
     axes, notes = found.axes, found.notes
-    if not axes and not found.gears:
-        yield " ".join(notes) or "There are no locked trials."
+    if not axes and not found.gears and not (results.trials["kind"] == "locked").any():
         return
     rows = []
     poses: dict[str, str] = {}
