@@ -113,8 +113,7 @@ def _show_charts(trends: TrendsResult) -> Iterator[Section]:
         text = (
             "Each point is the estimate of a session with two standard deviations, for the base "
             "model: later versions differ from session to session. The line is the median. "
-        )
-        text += (
+        ) + (
             "The band is the control limits, computed from the scatter between neighbouring "
             "sessions and from the uncertainty of each session: a session of an unchanged device "
             "lies beyond them once in 370 times. Sessions beyond them are named."

@@ -11,6 +11,7 @@ from bampipe.report.wording import format_digits
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.validate import ValidateResult
 
+FLOOR = "Noise floor: the error that sensor noise, quantisation and filtering alone would leave."
 _MOST_NAMED = 3
 """Held-out trials that a note can name."""
 

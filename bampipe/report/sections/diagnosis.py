@@ -46,14 +46,7 @@ def _show_model(
     yield phrases.limits(found)
     lacking = [axis for axis in axes if axis in found.lacking]
     if found.ranking and lacking:
-        rows = [
-            (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)))
-            for one in found.ranking[:_MOST_RANKED]
-        ]
-        more = len(found.ranking) - _MOST_RANKED
-        note = f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else ""
-        title, about = "Candidate effects, best first", "Axis | Indistinguishable from"
-        yield tabulate_candidates(title, rows, about, note).drop_empty_columns()
+        yield _tabulate_candidates(found.ranking)
         shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
         if len(shown) > 1:
             first = shown[0].log_evidence
@@ -130,28 +123,24 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
     )
 
 
-def tabulate_candidates(
-    title: str, rows: Sequence[tuple[RankedEffect, Sequence[str]]], about: str, note: str = ""
-) -> Table:
-    """Return candidate effects with the error without and with each, and its probability.
-
-    Args:
-        title: of the table; note: below it.
-        rows: candidates, each with the cells of the columns ``about``.
-    """
+def _tabulate_candidates(ranking: Sequence[RankedEffect]) -> Table:
+    more = len(ranking) - _MOST_RANKED
+    note = f"{count_noun(more, 'candidate')} further down not shown. " if more > 0 else ""
     return Table(
-        title,
-        f"Effect :code | {about} | >Without | >With | Unit :unit | >Probability | >p :p",
+        "Candidate effects, best first",
+        "Effect :code | Axis | Indistinguishable from | >Without | >With | Unit :unit"
+        " | >Probability | >p :p",
         [
             (
-                *(one.effect, *more, one.held_out_rmse_before, one.held_out_rmse_after),
-                *(one.unit, phrases.probability(one.probability), one.p_value),
+                *(one.effect, one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)),
+                *(one.held_out_rmse_before, one.held_out_rmse_after, one.unit),
+                *(phrases.probability(one.probability), one.p_value),
             )
-            for one, more in rows
+            for one in ranking[:_MOST_RANKED]
         ],
-        f"{note} Without and with: RMSE on held-out trials, one of them scaled by the weighted "
-        "misfit. p: probability that replicates give any candidate such a gain.".lstrip(),
-    )
+        f"{note}Without and with: RMSE on held-out trials, one of them scaled by the weighted "
+        "misfit. p: probability that replicates give any candidate such a gain.",
+    ).drop_empty_columns()
 
 
 def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Figure:

@@ -178,10 +178,9 @@ def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.Da
     few = [n for n in _PANEL_COLUMNS if len(groups) <= n * _MOST_PANEL_ROWS] or _PANEL_COLUMNS[-1:]
     columns = min(few, key=lambda columns: (-len(groups) % columns, columns))
     figure, panels = style.make_grid(len(groups), columns, 1.35)
-    shown = trace.iloc[style.thin(len(trace), 1500)]
     again = trace.loc[trace["run"] > 0, "t_total"].to_numpy() if "run" in trace else np.array([])
     for number, (panel, (kind, unit, names)) in enumerate(zip(panels, groups, strict=True)):
-        _draw_traces(results, panel, shown, names)
+        _draw_traces(results, panel, trace, names)
         style.mark_trials(panel, trace)
         if again.size:
             panel.axvline(again[0], color=style.INK, lw=0.6, zorder=0)
@@ -203,18 +202,14 @@ def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.Da
     return style.finish(figure, "convergence", caption)
 
 
-def _draw_traces(results: Results, panel: Any, shown: pd.DataFrame, names: Sequence[str]) -> None:
+def _draw_traces(results: Results, panel: Any, trace: pd.DataFrame, names: Sequence[str]) -> None:
     """Draw the estimates of one panel with their bounds and design values."""
-    t = shown["t_total"].to_numpy()
     for number, name in enumerate(names):
         axis = name.split(".")[-1]
         place = results.axes.index(axis) if axis in results.axes else number
         colour = style.SERIES[place % len(style.SERIES)]
-        value = shown[name].to_numpy()
         title = axis if axis in results.axes else "estimate"
-        panel.plot(t, value, color=colour, ls=_DASHES[place % len(_DASHES)], label=title)
-        half = NORMAL_95 * shown[f"{name}_sd"].to_numpy()
-        panel.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
+        style.draw_estimate(panel, trace, name, colour, title, _DASHES[place % len(_DASHES)])
     design = (results.paper or {}).get("design", {})
     for one in (design[name] for name in names if name in design):
         panel.axhline(one["value"], color=style.INK, lw=0.8, ls="--", label=one["label"])

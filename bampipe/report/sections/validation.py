@@ -44,10 +44,9 @@ def list_blocks(results: Results) -> Iterator[Block]:
         "Axis | >Held-out RMSE ~1 | >Noise floor ~1 | >RMSE, all trials ~1"
         " | >RMSE without friction ~1.2 | >Fit (%) ~0.6 | Unit :unit",
         rows,
-        f"Held out: {verdicts.describe_held_out(validated)}. Noise floor: the error that sensor "
-        "noise, quantisation and filtering alone would leave. Fit: share of the measured force "
-        "that is explained, as 100 (1 − held-out RMSE / standard deviation). Both forces are "
-        f"low-passed {each}.",
+        f"Held out: {verdicts.describe_held_out(validated)}. {verdicts.FLOOR} Fit: share of the "
+        "measured force that is explained, as 100 (1 − held-out RMSE / standard deviation). Both "
+        f"forces are low-passed {each}.",
     )
     trials = []
     for name, trial in validated.trials.items():
