@@ -22,7 +22,7 @@ _MARK = re.compile(
     r"|\[(?P<words>[^\]]+)\]\((?P<page>[\w./%+-]+\.html)\)"
 )
 
-_BEFORE_UNIT = re.compile(r" (?=%)|(?<=\d) (?=[kmµ]?(?:N|m|rad|s|g|Hz)\b)")
+_BEFORE_UNIT = re.compile(r" (?=%)|(?<=±) |(?<=\d) (?=[kmµ]?(?:N|m|rad|s|g|Hz)\b)")
 _COLUMN = re.compile(r"(?P<right>>?)(?P<title>.*?)(?: ~(?P<width>[\d.]+))?", re.DOTALL)
 _FORM = re.compile(r" :(\S+)")
 

@@ -72,8 +72,7 @@ def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
         "equations and from the numbers of the device file."
     )
     if identified.base_parameters:
-        words = "The motion of a robot determines only combinations of its inertial numbers"
-        words += " (under Identification)."
+        words = "The motion of a robot determines only combinations of its inertial numbers."
     if known.weak_directions:
         words = "Some parameters are known less well than their intervals suggest."
     if identified.inertial:
