@@ -130,7 +130,7 @@ def test_the_command_prints_tables_and_writes_json_and_a_page(
     assert "viscous.joint changed by +" in said and "p (Holm)" in said
     assert "Refitted in viscous.joint +" in said
     html = out.read_text()
-    assert "The device changed" in html and html.count("<table") == 4 and "<svg" in html
+    assert "The sessions differ" in html and html.count("<table") == 4 and "<svg" in html
     code, said, _ = command("compare", sessions["first"], sessions["thick"], "--json")
     pair = PairResult.model_validate(json.loads(said))
     assert code == 0 and build_page(pair) == html

@@ -52,13 +52,13 @@ def after_loop(root: Path, model: str) -> str:
 def after_proposal(root: Path, model: str) -> str:
     """Return the next step after a trial has been proposed for ``model``.
 
-    Effects that a diagnosis has found come first, unless the trial is to decide about them.
+    Effects that a diagnosis has found come first, unless a trial is to decide about them.
     """
     run = RunFolder(root)
     proposed = run.read(NextResult, model)
     if proposed.purpose != "decision":
         found = run.find(DiagnoseResult, model)
-        if found is not None and found.selected:
+        if found is not None and found.selected and "bampipe next " not in found.next:
             return _after_diagnosis(run, model, found.next)
         if found is None and _is_above_floor(run, model):
             return f"bampipe diagnose RUN{run.model_option(model)}"

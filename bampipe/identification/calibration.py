@@ -74,7 +74,7 @@ def _sources(
 def describe_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> tuple[str, ...]:
     """Report the calibration's part in the intervals, or that no uncertainty is stated."""
     if all(name.startswith(ZERO_OF) for name in moved):
-        return ("No uncertainty of gains, scales and constants is stated or included.",)
+        return ("No uncertainty of gains, scales or constants is stated, so none is included.",)
     sd = np.maximum(estimate.sd, np.finfo(float).tiny)
     largest = max(moved, key=lambda name: float(np.max(np.abs(moved[name]) / sd)))
     return (

@@ -96,7 +96,7 @@ def find_failed_checks(
     for axis, tests in (tested or {}).items():
         white, independent = tests.whiteness, tests.inputs
         if (white and not white.white) or (independent and not independent.independent):
-            yield f"{axis}, innovations: {tests.sentence}"
+            yield f"{axis}, innovations: {tests.sentence[:1].lower()}{tests.sentence[1:]}"
     for axis, error in errors.items():
         if error.standing in FLOOR_WRONG:
             yield f"{axis}: the error is {STANDINGS[error.standing]}"

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from bampipe.report.wording import format_entry, format_prose
+from bampipe.report.wording import NONE, format_entry, format_prose
 
 Tone = Literal["good", "attention", "unknown", "note"]
 Span = tuple[Literal["plain", "strong", "code", "link"], str]
@@ -22,26 +22,31 @@ _MARK = re.compile(
     r"|\[(?P<words>[^\]]+)\]\((?P<page>[\w./%+-]+\.html)\)"
 )
 
+_BEFORE_UNIT = re.compile(r" (?=%)|(?<=±) |(?<=\d) (?=[kmµ]?(?:N|m|rad|s|g|Hz)\b)")
 _COLUMN = re.compile(r"(?P<right>>?)(?P<title>.*?)(?: ~(?P<width>[\d.]+))?", re.DOTALL)
 _FORM = re.compile(r" :(\S+)")
 
 
 def split_spans(text: str) -> list[Span]:
-    """Split ``text`` at its inline marks, in order."""
+    """Split ``text`` at its inline marks, in order; a unit stays on the line of its number."""
+
+    def show(prose: str) -> str:
+        return _BEFORE_UNIT.sub("\u00a0", format_prose(prose))
+
     found: list[Span] = []
     end = 0
     for match in _MARK.finditer(text):
         if match.start() > end:
-            found.append(("plain", format_prose(text[end : match.start()])))
+            found.append(("plain", show(text[end : match.start()])))
         if match["strong"] is not None:
-            found.append(("strong", format_prose(match["strong"])))
+            found.append(("strong", show(match["strong"])))
         elif match["code"] is not None:
             found.append(("code", match["code"]))
         else:
             found.append(("link", f"{match['words']}\n{match['page']}"))
         end = match.end()
     if end < len(text):
-        found.append(("plain", format_prose(text[end:])))
+        found.append(("plain", show(text[end:])))
     return found
 
 
@@ -123,9 +128,9 @@ class Table:
         ]
 
     def drop_empty_columns(self) -> Table:
-        """Return the table without the columns that are empty in every row."""
+        """Return the table without the columns that say nothing in any row."""
         titles = self.columns.split(" | ")
-        full = [k for k in range(len(titles)) if any(row[k] for row in self.rows)]
+        full = [k for k in range(len(titles)) if {row[k] for row in self.rows} - {"", NONE}]
         rows = tuple(tuple(row[k] for k in full) for row in self.rows)
         return replace(self, columns=" | ".join(titles[k] for k in full), rows=rows)
 

@@ -113,8 +113,7 @@ def _show_charts(trends: TrendsResult) -> Iterator[Section]:
         text = (
             "Each point is the estimate of a session with two standard deviations, for the base "
             "model: later versions differ from session to session. The line is the median. "
-        )
-        text += (
+        ) + (
             "The band is the control limits, computed from the scatter between neighbouring "
             "sessions and from the uncertainty of each session: a session of an unchanged device "
             "lies beyond them once in 370 times. Sessions beyond them are named."
@@ -195,7 +194,7 @@ def _tabulate_charts(charts: list[ControlChart]) -> Table:
         "Between: scatter between sessions, without the uncertainty within them. Within: median "
         "standard deviation of a session's estimate. Trend: median slope (Theil and Sen), and the "
         "probability of so clear a trend by chance (Kendall).",
-    )
+    ).drop_empty_columns()
 
 
 def _show_errors(folder: Path, trends: TrendsResult) -> Iterator[Section]:

@@ -63,9 +63,9 @@ def tabulate_pair(pair: PairResult) -> list[Table]:
 def build_page(pair: PairResult) -> str:
     """Return the page as HTML."""
     changed = any(one.changed for one in pair.parameters.values())
-    changed |= any(one.failed for one in pair.journeys)
+    changed |= any(one.failed for one in pair.journeys) or any(one.changed for one in pair.states)
     tone: Tone = "attention" if changed else "good"
-    verdict = "The device changed" if changed else "Nothing changed beyond chance"
+    verdict = "The sessions differ" if changed else "Nothing changed beyond chance"
     blocks: list[Block] = [Callout(tone, verdict, "\n".join(pair.sentences)), pair.notes]
     with style.use_style():
         blocks += [*tabulate_pair(pair), *(_draw_states(pair, a) for a in pair.journeys[0].axes)]

@@ -56,7 +56,6 @@ def _sheet(
 
 def _tabulate_uncertainties(plan: Plan, model: str, listed: int) -> Table:
     """Tabulate the standard deviations farthest above the required limit."""
-
     left = {name: e.after / e.asked if e.asked > 0.0 else 0.0 for name, e in plan.sd.items()}
     far = set(sorted(left, key=lambda name: -left[name])[:listed])
     table = tabulate_sds("Standard deviations", {n: e for n, e in plan.sd.items() if n in far})

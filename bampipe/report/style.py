@@ -19,6 +19,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from bampipe.report import document
 from bampipe.report.wording import break_lines, choose_scale, format_unit, split_name
+from bampipe.results.intervals import NORMAL_95
 
 COLOURS = {
     "ink": "#1c2024", "faint": "#b4b8bd", "blue": "#0072b2", "vermillion": "#d55e00",
@@ -178,6 +179,17 @@ def draw_series(
     """Draw a time series, thinned to what a printed line can show."""
     keep = thin(len(x), 2000)
     axes.plot(x[keep], y[keep], color=colour, label=name, **more)  # type: ignore[arg-type]
+
+
+def draw_estimate(
+    axes: Axes, trace: pd.DataFrame, name: str, colour: str, label: str, dashes: Any = "-"
+) -> None:
+    """Draw a column of a trace with its 95 % bounds, thinned."""
+    shown = trace.iloc[thin(len(trace), 1500)]
+    t, value = shown["t_total"].to_numpy(), shown[name].to_numpy()
+    half = NORMAL_95 * shown[f"{name}_sd"].to_numpy()
+    axes.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
+    axes.plot(t, value, color=colour, ls=dashes, label=label)
 
 
 def mark_trials(axes: Axes, trace: pd.DataFrame) -> None:

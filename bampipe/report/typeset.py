@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -26,9 +25,8 @@ from bampipe.report.document import (
 _TEMPLATE = Path(__file__).parent / "templates" / "report.typ"
 _NORMAL_SIZE, _SMALL_SIZE = 9.0, 8.0
 _MANY_COLUMNS = 7
-_MANY_ROWS, _MANY_LETTERS = 8, 1500
+_MANY_ROWS, _MANY_LETTERS = 14, 1500
 """Size beyond which a table may continue on the next page."""
-_BEFORE_UNIT = re.compile(r" (?=%)|(?<=\d) (?=[kmµ]?(?:N|m|rad|s|g|Hz)\b)")
 _VERBATIM = ("name", "tone", "lines", "columns")
 """Fields of blocks without inline marks."""
 
@@ -129,7 +127,6 @@ def _split_spans(text: str | Sequence[Any]) -> list[Any]:
         return [_split_spans(item) for item in text]
     shown = []
     for kind, body in split_spans(text):
-        # A unit stays on the line of its number.
-        words = body if kind == "code" else _BEFORE_UNIT.sub("\u00a0", body.partition("\n")[0])
+        words = body.partition("\n")[0] if kind == "link" else body
         shown.append(("plain" if kind == "link" else kind, words))
     return shown or [("plain", "")]

@@ -11,6 +11,7 @@ from bampipe.report.wording import format_digits
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.validate import ValidateResult
 
+FLOOR = "Noise floor: the error that sensor noise, quantisation and filtering alone would leave."
 _MOST_NAMED = 3
 """Held-out trials that a note can name."""
 
@@ -20,9 +21,9 @@ def describe_held_out(validated: ValidateResult) -> str:
     names = [name for name, trial in validated.trials.items() if trial.held_out]
     if not names:
         return "nothing could be held out, so the error is that of the fit"
-    if len(validated.trials) == 1:
-        return "each part of the trial predicted with the estimate from its other parts"
     if len(names) == len(validated.trials):
+        if len({name.partition("@")[0] for name in names}) == 1:
+            return "each part of the trial predicted with the estimate from its other parts"
         return "each trial predicted with the estimate from the others"
     which = f"trial{'s' * (len(names) > 1)} {join_names(names)}"
     if len(names) > _MOST_NAMED:

@@ -91,6 +91,11 @@ def format_with_sd(value: float | None, sd: float | None) -> str:
     return _join_numbers(" ± ", value, sd, decimals, power)
 
 
+def format_quantity(value: float, sd: float, unit: str) -> str:
+    """Return ``value ± sd`` with its unit."""
+    return f"{format_with_sd(value, sd)} {format_unit(unit)}".rstrip()
+
+
 def format_interval(low: float, high: float, sd: float | None) -> str:
     """Return ``low to high``, rounded as :func:`format_with_sd` rounds."""
     decimals, power = find_digits(0.5 * (low + high), sd if sd else (high - low) / 4.0)

@@ -72,8 +72,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     diagnosis = run.read(DiagnoseResult, config.model)
     if not diagnosis.unnamed_axes:
         raise NothingToDoError(
-            f"nothing to draft: the effects that the diagnosis of model {diagnosis.model!r} names"
-            " explain all of the residual",
+            f"nothing to draft: by the diagnosis, model {diagnosis.model!r} and the effects that it"
+            " names explain all of the residual",
             where=str(run.root),
             remedy="a formula is drafted only if something `remains` that no named effect explains",
         )

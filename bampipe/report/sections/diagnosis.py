@@ -46,14 +46,7 @@ def _show_model(
     yield phrases.limits(found)
     lacking = [axis for axis in axes if axis in found.lacking]
     if found.ranking and lacking:
-        rows = [
-            (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)))
-            for one in found.ranking[:_MOST_RANKED]
-        ]
-        more = len(found.ranking) - _MOST_RANKED
-        note = f"{count_noun(more, 'candidate')} further down not shown." if more > 0 else ""
-        title, about = "Candidate effects, best first", "Axis | Indistinguishable from"
-        yield tabulate_candidates(title, rows, about, note).drop_empty_columns()
+        yield _tabulate_candidates(found.ranking)
         shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
         if len(shown) > 1:
             first = shown[0].log_evidence
@@ -65,7 +58,7 @@ def _show_model(
             )
         yield phrases.null_distribution(found.chance)
     yield _advise(results, found) if lacking else _tell_sensitivity(results, model)
-    if found.suggested_trial is not None:
+    if found.suggested_trial is not None and results.read(NextResult, model) is None:
         yield Callout("note", "A trial that would tell more", found.suggested_trial.sentence)
     for axis in lacking:
         if maps := found.maps.get(axis):
@@ -105,6 +98,8 @@ def _advise(results: Results, found: DiagnoseResult) -> str:
             return f"Added since, as model `{rung.model}`."
     if found.next.startswith("bampipe draft ") and results.read(DraftResult, found.model):
         return "Drafted since (under Drafts)."
+    if found.next.startswith("bampipe next ") and results.read(NextResult, found.model):
+        return f"The trial to record is under {next_trial.TITLE}."
     return results.state_next(found.next)
 
 
@@ -128,28 +123,24 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
     )
 
 
-def tabulate_candidates(
-    title: str, rows: Sequence[tuple[RankedEffect, Sequence[str]]], about: str, note: str = ""
-) -> Table:
-    """Return candidate effects with the error without and with each, and its probability.
-
-    Args:
-        title: of the table; note: below it.
-        rows: candidates, each with the cells of the columns ``about``.
-    """
+def _tabulate_candidates(ranking: Sequence[RankedEffect]) -> Table:
+    more = len(ranking) - _MOST_RANKED
+    note = f"{count_noun(more, 'candidate')} further down not shown. " if more > 0 else ""
     return Table(
-        title,
-        f"Effect :code | {about} | >Without | >With | Unit :unit | >Probability | >p :p",
+        "Candidate effects, best first",
+        "Effect :code | Axis | Indistinguishable from | >Without | >With | Unit :unit"
+        " | >Probability | >p :p",
         [
             (
-                *(one.effect, *more, one.held_out_rmse_before, one.held_out_rmse_after),
-                *(one.unit, phrases.probability(one.probability), one.p_value),
+                *(one.effect, one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from)),
+                *(one.held_out_rmse_before, one.held_out_rmse_after, one.unit),
+                *(phrases.probability(one.probability), one.p_value),
             )
-            for one, more in rows
+            for one in ranking[:_MOST_RANKED]
         ],
-        f"{note} Without and with: RMSE on held-out trials, one of them scaled by the weighted "
-        "misfit. p: probability that replicates give any candidate such a gain.".lstrip(),
-    )
+        f"{note}Without and with: RMSE on held-out trials, one of them scaled by the weighted "
+        "misfit. p: probability that replicates give any candidate such a gain.",
+    ).drop_empty_columns()
 
 
 def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Figure:
@@ -167,7 +158,8 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
         " with its confidence band against its possible causes. Where the band excludes zero,"
         " the model lacks something."
     )
-    return style.finish(figure, f"residual-maps-{model}-{axis}", caption, panels[:1])
+    name = f"residual-maps-{model}-{axis}"
+    return style.finish(figure, name, caption, panels[:1] if later else ())
 
 
 def draw_maps(panel: Any, name: str, shown: Sequence[tuple[ResidualMap, str, str]]) -> None:

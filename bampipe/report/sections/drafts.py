@@ -74,7 +74,7 @@ def _draw(
     panel = panels[-2]
     counts = [option.constants for option in entry.options]
     errors = [option.held_out_rmse for option in entry.options]
-    panel.plot(counts, errors, color=style.INK, marker="o", ms=3.5, lw=0.8)
+    panel.plot(counts, errors, "o", color=style.INK, ms=3.5)
     panel.axhline(entry.noise_floor, color=style.BLUE, lw=0.8)
     style.use_decades(panel, [*errors, entry.noise_floor])
     panel.set(xticks=sorted(set(counts)), xlabel="constants")
@@ -90,7 +90,7 @@ def _draw(
     panel.set_yscale("symlog", linthresh=10.0)
     names = ["first formula", "second"][: len(entry.chance)]
     panel.set_xticks(range(len(names)), names)
-    panel.set(xlim=(-0.5, len(names) - 0.2), ylabel="gain")
+    panel.set(xlim=(-0.5, len(names) - 0.2), ylabel="gain (nats)")
     if not effects:
         caption = (
             f"The search on {axis}: error on held-out trials against the number of constants, with "

@@ -10,10 +10,9 @@ from matplotlib.axes import Axes
 from bampipe.lists import join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Formulas, Subheading
+from bampipe.report.document import Block, Figure, Formulas, Subheading, Table
 from bampipe.report.run_results import Results
-from bampipe.report.sections.diagnosis import tabulate_candidates
-from bampipe.report.wording import format_digits, format_unit, format_with_sd, split_name
+from bampipe.report.wording import format_digits, format_quantity, format_unit, split_name
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult, WorstWindow
 from bampipe.results.identify import IdentifyResult
@@ -55,12 +54,11 @@ def list_blocks(results: Results) -> Iterator[Block]:
     diagnosis = next((found for found in _read_diagnoses(results) if found.descriptions), None)
     texts = diagnosis.descriptions if diagnosis else {}
     rows = [
-        (one, [f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2])])
+        (one.effect, f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2]))
         for one in (diagnosis.ranking if diagnosis else ())
         if one.effect not in added and (text := texts.get(one.effect.partition(":")[0]))
     ][:_MOST_CANDIDATES]
-    title = f"Weighed on model `{diagnosis.model if diagnosis else ''}`, best first"
-    yield tabulate_candidates(title, rows, "Description and formula ~2.6")
+    yield Table("Candidates in words, best first", "Effect :code | Meaning and formula ~1", rows)
 
 
 def _list_estimates(results: Results, term: ModelTerm) -> str:
@@ -68,7 +66,7 @@ def _list_estimates(results: Results, term: ModelTerm) -> str:
     known = identified.parameters if identified else {}
     shown = []
     for name, one in ((name, known[name]) for name in term.parameters if name in known):
-        value = f"{format_with_sd(one.estimate, one.sd)} {format_unit(one.unit)}".rstrip()
+        value = format_quantity(one.estimate, one.sd, one.unit)
         shown.append(f"{split_name(name.rpartition('.')[2])} {value}")
     return f"Found: {'; '.join(shown)}." if shown else ""
 

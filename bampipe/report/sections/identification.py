@@ -45,12 +45,12 @@ def list_blocks(results: Results) -> Iterator[Block | None]:
     texts = [format_decimals(one.estimate, *find_digits(one.estimate, one.sd)) for one in found]
     yield Table(
         "Combinations of inertial numbers that motion determines",
-        "Combination ~3 | >Estimate | >SD :2 | >Drawing | Shown | Unit :unit",
+        "Combination :code ~3 | >Estimate | >SD :2 | >Drawing | From trials | Unit :unit",
         [
             (one.combination, text, one.sd, (one.drawn, one.drawn_sd), one.shown, one.unit)
             for one, text in zip(found, texts, strict=True)
         ],
-        "Shown: whether its SD is less than half of that of the drawing.",
+        "From trials: whether its SD is less than half of that of the drawing.",
     )
     known = identified.identifiability.sentences if identified.identifiability else ()
     yield tuple(note for note in identified.notes if note not in known)
@@ -147,24 +147,22 @@ def _list_checks(identified: IdentifyResult) -> str:
     if settled and convergence.total_s:
         last = max(settled, key=lambda name: (settled[name], name))
         parts.append(
-            f"All estimates had settled after {format_decimals(settled[last], 1)} s of the "
-            f"{format_decimals(convergence.total_s, 1)} s of the first and the last run of the "
-            f"filter (`{last}` settled last)."
+            f"All estimates had settled after {format_decimals(settled[last], 1)} s of "
+            f"{format_decimals(convergence.total_s, 1)} s in the filter (`{last}` last)."
         )
     if not convergence.converged:
         parts.append("**The estimates have not converged.**")
     if identified.nis is not None:
         mean = format_digits(identified.nis.mean, 2)
         parts.append(
-            f"The mean normalised innovation squared is {mean}; it is 1 if the noise levels are "
-            "right."
+            f"The mean normalised innovation squared is {mean}; it would be 1 with the right noise "
+            "levels."
         )
     lag, sd = 1e3 * timing.estimate, 1e3 * timing.sd  # ms; 0 where it was not estimated
     verb = "lags" if lag > 0.0 else "leads"
     text = f"The force {verb} the encoders by {format_with_sd(abs(lag), sd)} ms."
     if abs(lag) < NORMAL_95 * sd:
-        shown = f"(the force lags by {format_with_sd(lag, sd)} ms)"
-        text = f"No delay between force and encoders is shown {shown}."
+        text = f"The force shows no delay against the encoders ({format_with_sd(lag, sd)} ms)."
     return " ".join([*parts, *([text] if sd > 0.0 else [])])
 
 
@@ -180,10 +178,9 @@ def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.Da
     few = [n for n in _PANEL_COLUMNS if len(groups) <= n * _MOST_PANEL_ROWS] or _PANEL_COLUMNS[-1:]
     columns = min(few, key=lambda columns: (-len(groups) % columns, columns))
     figure, panels = style.make_grid(len(groups), columns, 1.35)
-    shown = trace.iloc[style.thin(len(trace), 1500)]
     again = trace.loc[trace["run"] > 0, "t_total"].to_numpy() if "run" in trace else np.array([])
     for number, (panel, (kind, unit, names)) in enumerate(zip(panels, groups, strict=True)):
-        _draw_traces(results, panel, shown, names)
+        _draw_traces(results, panel, trace, names)
         style.mark_trials(panel, trace)
         if again.size:
             panel.axvline(again[0], color=style.INK, lw=0.6, zorder=0)
@@ -205,18 +202,14 @@ def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.Da
     return style.finish(figure, "convergence", caption)
 
 
-def _draw_traces(results: Results, panel: Any, shown: pd.DataFrame, names: Sequence[str]) -> None:
+def _draw_traces(results: Results, panel: Any, trace: pd.DataFrame, names: Sequence[str]) -> None:
     """Draw the estimates of one panel with their bounds and design values."""
-    t = shown["t_total"].to_numpy()
     for number, name in enumerate(names):
         axis = name.split(".")[-1]
         place = results.axes.index(axis) if axis in results.axes else number
         colour = style.SERIES[place % len(style.SERIES)]
-        value = shown[name].to_numpy()
         title = axis if axis in results.axes else "estimate"
-        panel.plot(t, value, color=colour, ls=_DASHES[place % len(_DASHES)], label=title)
-        half = NORMAL_95 * shown[f"{name}_sd"].to_numpy()
-        panel.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
+        style.draw_estimate(panel, trace, name, colour, title, _DASHES[place % len(_DASHES)])
     design = (results.paper or {}).get("design", {})
     for one in (design[name] for name in names if name in design):
         panel.axhline(one["value"], color=style.INK, lw=0.8, ls="--", label=one["label"])

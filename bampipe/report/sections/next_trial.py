@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
+from bampipe.phrases.proposal import say_chance
 from bampipe.report.document import Block, Callout, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits
@@ -20,13 +21,16 @@ def list_blocks(results: Results) -> Iterator[Block]:
         return
     yield Callout("note", "The next trial", found.sentence)
     yield f"{found.why} {found.expected}"
+    best, inertial = found.proposals[0], set[str]()
     if identified := results.read(IdentifyResult):
+        inertial = {*identified.inertial}
         forecasts = read_forecasts(results.root, results.model)
         lines = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
         yield tuple(one.replace("RUN", results.root.name) for one in lines)
-    best, heads = found.proposals[0], ("with the present trials", "with the next one")
+    heads = ("with the present trials", "with the next one")
     yield tabulate_confusion("Probability of confusing two effects", heads, best.confusion)
-    yield tabulate_sds("Standard deviation of each parameter, now and with the next trial", best.sd)
+    sds = {name: sd for name, sd in best.sd.items() if name not in inertial}
+    yield tabulate_sds("Standard deviation of each parameter, now and with the next trial", sds)
 
     def factor(pair: tuple[str, Detectable]) -> float:
         return float("inf") if pair[1].smallest is None else pair[1].smallest / pair[1].typical
@@ -52,8 +56,11 @@ def tabulate_confusion(
     title: str, heads: tuple[str, str], pairs: Sequence[PlannedConfusion]
 ) -> Table:
     """Tabulate the probability of confusing two effects, without and with new trials."""
-    rows = [(" or ".join(f"`{n}`" for n in p.between), p.before, p.after) for p in pairs]
-    return Table(title, f"Effects | >{heads[0]} :% | >{heads[1]} :%", rows)
+    rows = [
+        (" or ".join(f"`{n}`" for n in p.between), say_chance(p.before), say_chance(p.after))
+        for p in pairs
+    ]
+    return Table(title, f"Effects | >{heads[0]} | >{heads[1]}", rows)
 
 
 def tabulate_sds(title: str, entries: Mapping[str, ExpectedSd]) -> Table:

@@ -17,14 +17,12 @@ TITLE = "Stiffness"
 def list_blocks(results: Results) -> Iterator[Block]:
     """Yield the stiffness of axes and gears; nothing for a session without locked trials."""
     found = results.read(StiffnessResult)
-    if found is None and (results.trials["kind"] == "locked").any():
+    is_locked = bool((results.trials["kind"] == "locked").any())
+    if found is None and is_locked:
         yield results.state_undone("The locked trials have not been used", "stiffness")
-    if found is None:
+    if found is None or not (found.axes or found.gears or is_locked):
         return
     axes, notes = found.axes, found.notes
-    if not axes and not found.gears:
-        yield " ".join(notes) or "There are no locked trials."
-        return
     rows = []
     poses: dict[str, str] = {}
     for axis, one in results.order_axes(axes).items():

@@ -12,9 +12,9 @@ from bampipe.report.wording import (
     NONE,
     format_decimals,
     format_digits,
+    format_quantity,
     format_scaled,
     format_unit,
-    format_with_sd,
     name_parameter,
 )
 from bampipe.results.compare import CompareResult
@@ -29,9 +29,8 @@ _MOST_OTHERS = 12
 """Most parameters other than friction that a note names."""
 _FRICTION = ("viscous.", "coulomb.")
 _TERMS = (
-    "RMSE: root mean square of measured minus predicted force. Noise floor: the error that sensor "
-    "noise, quantisation and filtering alone would leave. Fit: 100 (1 − RMSE / standard deviation "
-    "of the measured force)."
+    f"RMSE: root mean square of measured minus predicted force. {verdicts.FLOOR} Fit: 100 (1 − RMSE"
+    " / standard deviation of the measured force)."
 )
 
 
@@ -78,8 +77,9 @@ def _describe_session(results: Results) -> str:
             f"{METHODS[identified.method]}."
         )
     if validated := results.read(ValidateResult):
-        where = "held-out" if any(t.held_out for t in validated.trials.values()) else "the same"
-        parts.append(f"The predicted force was compared with the measured one on {where} trials.")
+        is_held_out = any(t.held_out for t in validated.trials.values())
+        where = "held-out data" if is_held_out else "the same trials"
+        parts.append(f"The predicted force was compared with the measured one on {where}.")
     return " ".join(parts)
 
 
@@ -163,9 +163,7 @@ def _share_unit(title: str, cells: list[str]) -> tuple[str, ...]:
 
 
 def _format_estimate(entry: ParameterEstimate | None) -> str:
-    if entry is None:
-        return NONE
-    return f"{format_with_sd(entry.estimate, entry.sd)} {format_unit(entry.unit)}".rstrip()
+    return format_quantity(entry.estimate, entry.sd, entry.unit) if entry else NONE
 
 
 def _format_error(entry: JudgedError | None, key: str) -> str:

@@ -8,6 +8,10 @@ from bampipe.report.wording import format_decimals
 from bampipe.results.identify import IdentifiabilityReport, IdentifyResult
 
 TITLE = "Trust in the estimates"
+_BIAS_NOTE = (
+    " Bias of filtering: the bias that filtered velocities give plain least squares, found from"
+    " replicates of the fit, and subtracted."
+)
 
 
 def list_blocks(results: Results) -> Iterator[Block]:
@@ -33,10 +37,8 @@ def list_blocks(results: Results) -> Iterator[Block]:
             rows,
             "Bound: Cramér-Rao, the least that sensor noise allows on these trials. Alone: the same"
             " if all others were known. Correlated with: the parameter whose error is most"
-            " correlated with this one. Bias of filtering: the bias that filtered velocities give"
-            " plain least squares, found from replicates of the fit, and subtracted; the unscented"
-            " filter uses positions alone.",
-        )
+            " correlated with this one." + _BIAS_NOTE * any(row[5] is not None for row in rows),
+        ).drop_empty_columns()
         if len(known.trials) > 1:
             growth = [(name, one.growth, one.parameter) for name, one in known.trials.items()]
             caption = "Growth of a bound without each trial, for the parameter that needs it most"
@@ -70,8 +72,7 @@ def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
         "equations and from the numbers of the device file."
     )
     if identified.base_parameters:
-        words = "The motion of a robot determines only combinations of its inertial numbers"
-        words += " (under Identification)."
+        words = "The motion of a robot determines only combinations of its inertial numbers."
     if known.weak_directions:
         words = "Some parameters are known less well than their intervals suggest."
     if identified.inertial:

@@ -44,10 +44,9 @@ def list_blocks(results: Results) -> Iterator[Block]:
         "Axis | >Held-out RMSE ~1 | >Noise floor ~1 | >RMSE, all trials ~1"
         " | >RMSE without friction ~1.2 | >Fit (%) ~0.6 | Unit :unit",
         rows,
-        f"Held out: {verdicts.describe_held_out(validated)}. Noise floor: the error that sensor "
-        "noise, quantisation and filtering alone would leave. Fit: share of the measured force "
-        "that is explained, as 100 (1 − held-out RMSE / standard deviation). Both forces are "
-        f"low-passed {each}.",
+        f"Held out: {verdicts.describe_held_out(validated)}. {verdicts.FLOOR} Fit: share of the "
+        "measured force that is explained, as 100 (1 − held-out RMSE / standard deviation). Both "
+        f"forces are low-passed {each}.",
     )
     trials = []
     for name, trial in validated.trials.items():
@@ -142,8 +141,8 @@ def _draw_forces(results: Results, frame: pd.DataFrame) -> Figure:
     panels[-1, 0].set_xlabel("time (s)")
     caption = (
         f"Trial {frame['trial_id'].iloc[0]}{results.cite_paper('Fig. 9')}: the {results.pusher}'s "
-        "generalised force at each joint, measured and predicted by the inverse dynamics, with and "
-        "without its friction terms."
+        "generalised force on each axis, measured and predicted by inverse dynamics, with and "
+        "without friction."
     )
     return style.finish(figure, "force-prediction", caption, [panels[0, 0]])
 
@@ -219,7 +218,7 @@ def _draw_friction(
     panels[0, 0].plot([], [], "o", ms=3.5, color=style.BLUE, label="whole trial")
     places = ("Left", "Right") if alone else ("Top", "Bottom")
     caption = (
-        f"The friction that a model without it leaves{results.cite_paper('Fig. 4')}. {places[0]}: "
+        f"The error of the model without its friction{results.cite_paper('Fig. 4')}. {places[0]}: "
         "measured minus predicted generalised force against velocity; the arrow marks the start "
         f"of one movement. {places[1]}: that movement."
     )

@@ -61,16 +61,12 @@ def _compare(directions: Mapping[str, Damping]) -> str:
 def _draw(results: Results, directions: Mapping[str, Damping], trace: pd.DataFrame) -> Figure:
     names = [name for name in directions if f"damping_{name}" in trace]
     figure, panels = style.make_grid(len(names), len(names), 2.1, extra=0.0, column_width=1.9)
-    shown = trace.iloc[style.thin(len(trace), 1500)]
-    t = shown["t_total"].to_numpy()
-    late = slice(len(t) // 20, None)
+    late = trace.iloc[len(trace) // 20 :]
     for number, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        value = shown[f"damping_{name}"].to_numpy()
-        half = NORMAL_95 * shown[f"damping_{name}_sd"].to_numpy()
-        colour = style.SERIES[number % len(style.SERIES)]
-        panel.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
-        panel.plot(t, value, color=colour, label="estimate")
-        extent = [value[late] - half[late], value[late] + half[late]]
+        column, colour = f"damping_{name}", style.SERIES[number % len(style.SERIES)]
+        style.draw_estimate(panel, trace, column, colour, "estimate")
+        half = NORMAL_95 * late[f"{column}_sd"].to_numpy()
+        extent = [late[column].to_numpy() - half, late[column].to_numpy() + half]
         if (command := directions[name].commanded) is not None:
             panel.axhline(command, color=style.INK, lw=0.8, ls="--", label="commanded")
             extent.append(np.array([command]))

@@ -120,6 +120,6 @@ function drawScales(positions) {
   });
   const holder = make("div");
   holder.innerHTML = `<svg viewBox="0 0 ${BODY_PX} ${row * rows.length}" role="img" aria-label="The axes at the cursor">${rows.join("")}</svg>`;
-  holder.querySelectorAll("text").forEach((text, k) => (text.textContent = `${pose.channels[k].position} ${format(positions[pose.channels[k].position], 3)} ${pose.channels[k].unit}`));
+  holder.querySelectorAll("text").forEach((text, k) => (text.textContent = `${pose.channels[k].position} ${format(positions[pose.channels[k].position]?.toFixed(3) * 1)} ${pose.channels[k].unit}`));
   return holder.innerHTML;
 }
