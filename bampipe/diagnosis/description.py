@@ -7,7 +7,15 @@ import numpy as np
 from scipy.stats import gamma
 
 from bampipe.arrays import Array
-from bampipe.diagnosis.shape import BINS, Map, Variable, number_bins, residual_map, variables
+from bampipe.diagnosis.shape import (
+    BINS,
+    Variable,
+    number_bins,
+    residual_map,
+    take_used,
+    variables,
+)
+from bampipe.results.diagnose import ResidualMap
 from bampipe.results.rounding import significant
 from bampipe.trials.linearisation import Linearisation
 
@@ -40,61 +48,59 @@ def describe(linearisation: Linearisation, axis: int) -> str:
     every = variables(linearisation.fitted, linearisation.band, axis)
     known = [v for v in every if v.name not in ("trial", "direction")]
     maps = [residual_map(linearisation, axis, v, 3 * BINS) for v in known]
-    best = int(np.argmax([m.share for m in maps]))
-    most, variable = maps[best], known[best]
+    best = int(np.argmax([m.variance_share for m in maps]))
+    most, variable, share = maps[best], known[best], maps[best].variance_share
     unit = linearisation.system.torque_units[axis]
-    if most.share < _VARIABLE or most.variable == "time":
+    if share < _VARIABLE or variable.name == "time":
         vibration = _vibration(linearisation, axis)
-        if vibration is not None and vibration.share > max(most.share, _VARIABLE):
+        if vibration is not None and vibration.share > max(share, _VARIABLE):
             return (
                 f"a vibration of {significant(vibration.amplitude, 2)} {unit} at "
                 f"{vibration.frequency:.3g} Hz in time, independent of the motion; it explains "
                 f"{100 * vibration.share:.0f} % of the residual's variance"
             )
-    if most.share < _VARIABLE:
+    if share < _VARIABLE:
         return (
-            f"scattered over all motions; of all variables, {most.variable} explains most, "
-            f"{100 * most.share:.0f} %"
-            if most.share >= _MENTIONED
+            f"scattered over all motions; of all variables, {variable.name} explains most, "
+            f"{100 * share:.0f} %"
+            if share >= _MENTIONED
             else "scattered over all motions and independent of all variables of the motion"
         )
-    explains = f"{most.variable} explains {100 * most.share:.0f} % of the residual's variance"
+    explains = f"{variable.name} explains {100 * share:.0f} % of the residual's variance"
     turning = _by_direction(linearisation, axis, variable)
     ripple = _ripple(linearisation, axis, variable)
-    if ripple is not None and ripple.share > _RIPPLE * most.share:
+    if ripple is not None and ripple.share > _RIPPLE * share:
         period = 1.0 / ripple.frequency
         return (
-            f"a ripple of {significant(ripple.amplitude, 2)} {unit} along {most.variable} that "
+            f"a ripple of {significant(ripple.amplitude, 2)} {unit} along {variable.name} that "
             f"repeats every {period:.3g} {most.unit}, {turning}; {explains}"
         )
-    return f"{_bumps(most, unit)}, {turning}; {explains}"
+    return f"{_bumps(most, unit + ' near ' + variable.name)}, {turning}; {explains}"
 
 
-def _bumps(most: Map, torque_unit: str) -> str:
-    unit = f"{torque_unit} near {most.variable}"
-    strong = np.abs(most.mean) > _BUMP_HEIGHT * np.max(np.abs(most.mean))
+def _bumps(most: ResidualMap, unit: str) -> str:
+    center, mean = np.array(most.center), np.array(most.mean)
+    strong = np.abs(mean) > _BUMP_HEIGHT * np.max(np.abs(mean))
     places = []
-    for side in (strong & (most.mean < 0.0), strong & (most.mean > 0.0)):
+    for side in (strong & (mean < 0.0), strong & (mean > 0.0)):
         if side.any():
-            weight = np.abs(most.mean[side])
-            middle = float(np.average(most.center[side], weights=weight))
-            peak = most.mean[side][int(np.argmax(weight))]
+            weight = np.abs(mean[side])
+            middle = float(np.average(center[side], weights=weight))
+            peak = mean[side][int(np.argmax(weight))]
             places.append((middle, f"{peak:+.2g} {unit} {middle:.3g} {most.unit}".strip()))
     places.sort()
     narrow = strong.sum() <= _BUMP_WIDTH * len(strong)
     form = "a bump of" if narrow else "a broad change,"
     if len(places) == 2:
         form = "opposite bumps of" if narrow else "a change of sign,"
-    inside = most.center[strong]
+    inside = center[strong]
     between = f"{inside.min():.3g} and {inside.max():.3g} {most.unit}".strip()
     return f"{form} {' and '.join(words for _, words in places)} (between {between})"
 
 
 def _ripple(linearisation: Linearisation, axis: int, variable: Variable) -> _Sine | None:
     """Return the best sine along ``variable`` with at least two periods within its range."""
-    use = np.concatenate([u[:, axis] for u in linearisation.used]) > 0
-    r = np.concatenate([x[:, axis] for x in linearisation.residual])[use]
-    v = np.concatenate(variable.values)[use]
+    v, r = take_used(linearisation, axis, variable)
     low, high = np.quantile(v, [0.01, 0.99])
     if high <= low:
         return None

@@ -95,21 +95,14 @@ class Dictionary:
         pairs = zip(self.ranges[name], shape, strict=True)
         return np.array([r.value_at(r.interpolate(share)) for r, share in pairs])
 
-    def bounds(self, name: str) -> list[tuple[float, float]]:
-        """Return the smallest and largest strength of each column of a candidate."""
+    def priors(self, name: str) -> list[tuple[float, float, float]]:
+        """Return the bounds of each strength of a candidate, and its prior standard deviation."""
         c = self.candidates[name]
         if not c.linear_indices:
             # An effect of either sign is nearly linear below the smallest strength on the grid.
             least = 0.0 if any(r.low < 0.0 for r in self.ranges[name]) else _MULTIPLE[0]
-            return [(least, _MULTIPLE[1])]
-        return [(c.parameters[i].lower, c.parameters[i].upper) for i in c.linear_indices]
-
-    def spreads(self, name: str) -> list[float]:
-        """Return the prior standard deviation of each strength, from the effect's file."""
-        c = self.candidates[name]
-        if not c.linear_indices:
-            return [1.0]
-        return [c.parameters[i].sd for i in c.linear_indices]
+            return [(least, _MULTIPLE[1], 1.0)]
+        return [(q.lower, q.upper, q.sd) for q in (c.parameters[i] for i in c.linear_indices)]
 
     def make(self, key: Key) -> Atom | None:
         """Compute a candidate at one shape; None if it has no effect in these trials."""

@@ -130,9 +130,7 @@ class SetCosts:
             self.column_indices.append(np.concatenate(at) if at else np.zeros(0, dtype=int))
             self.xb.append(p.base[axis].T @ x)
         self.n_columns = int(sum(widths))
-        bounds = [b for key in places for b in self.dictionary.bounds(key[0])]
-        self.lower, self.upper = np.array(bounds).reshape(-1, 2).T
-        self.prior_sd = np.array([v for key in places for v in self.dictionary.spreads(key[0])])
+        self.lower, self.upper, self.prior_sd = self._priors(places).T
 
     def on_replicate(self, number: int) -> Self:
         """Return the costs on the residual of a replicate instead of the measured one."""
@@ -150,6 +148,11 @@ class SetCosts:
         other._set_problem(replace(self.problem, likelihood=likelihood))
         other._products_by_key = self._products_by_key  # of the same residual
         return other
+
+    def _priors(self, keys: Iterable[Key]) -> Array:
+        """Return lower and upper bound and prior standard deviation of each strength, (m, 3)."""
+        rows = [row for name, _ in keys for row in self.dictionary.priors(name)]
+        return np.array(rows).reshape(-1, 3)
 
     def _atom(self, key: Key) -> Atom:
         """Return the columns of a candidate that has an effect in these trials."""
@@ -194,9 +197,8 @@ class SetCosts:
         if delays > 1 or any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
         xx, xy, places = self._sums(keys)
-        limits = [pair for key in keys for pair in self.dictionary.bounds(key[0])]
-        bounds = np.array(limits).reshape(-1, 2)
-        spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
+        priors = self._priors(keys)
+        bounds, spread = priors[:, :2], priors[:, 2]
         # A strength that changes nothing over its whole prior is zero.
         bounds[np.einsum("a,akk->k", self._weight, xx[:, nb:, nb:]) * spread**2 < NOTHING**2] = 0.0
         expected = self._expected(keys)

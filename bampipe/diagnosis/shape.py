@@ -8,7 +8,7 @@ import numpy as np
 from bampipe.arrays import Array, Indices
 from bampipe.estimate.low_pass import Band
 from bampipe.physics.effect import state_units
-from bampipe.results.diagnose import WorstWindow
+from bampipe.results.diagnose import ResidualMap, WorstWindow
 from bampipe.trials.linearisation import Linearisation
 from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
@@ -26,28 +26,6 @@ class Variable:
     name: str
     unit: str
     values: tuple[Array, ...]
-
-
-@dataclass(frozen=True)
-class Map:
-    """Mean residual in bins of one variable, with 95 % confidence bands over independent samples.
-
-    Attributes:
-        variable, unit: name and unit of the variable.
-        center: mean of the variable in each bin.
-        mean, low, high: mean residual and its confidence band in each bin, N.m or N.
-        count: samples in each bin.
-        share: share of the residual's variance that the bin means explain.
-    """
-
-    variable: str
-    unit: str
-    center: Array
-    mean: Array
-    low: Array
-    high: Array
-    count: Array
-    share: float
 
 
 def variables(fitted: Sequence[ModelOnTrial], band: Band, axis: int) -> tuple[Variable, ...]:
@@ -111,13 +89,21 @@ def share_between(values: Array, which: Indices) -> float:
     return min(1.0, between / total) if total > 0.0 else 0.0
 
 
+def take_used(linearisation: Linearisation, axis: int, variable: Variable) -> tuple[Array, Array]:
+    """Return variable and residual of an axis at the samples that count, (n,) each."""
+    use = np.concatenate([u[:, axis] for u in linearisation.used]) > 0
+    left = np.concatenate([x[:, axis] for x in linearisation.residual])
+    return np.concatenate(variable.values)[use], left[use]
+
+
 def residual_map(
     linearisation: Linearisation, axis: int, variable: Variable, bins: int = BINS
-) -> Map:
-    """Average the residual of ``axis`` in ``bins`` parts of ``variable`` with equal counts."""
-    use = np.concatenate([u[:, axis] for u in linearisation.used]) > 0
-    r = np.concatenate([x[:, axis] for x in linearisation.residual])[use]
-    v = np.concatenate(variable.values)[use]
+) -> ResidualMap:
+    """Average the residual of ``axis`` in ``bins`` parts of ``variable`` with equal counts.
+
+    The confidence band is of 95 %, over independent samples.
+    """
+    v, r = take_used(linearisation, axis, variable)
     levels = np.unique(v)
     which = np.searchsorted(levels, v) if len(levels) <= bins else number_bins(v, bins)
     rows = [
@@ -125,14 +111,16 @@ def residual_map(
         for b in np.unique(which)
         if np.sum(which == b) >= _LEAST
     ]
-    if not rows:
-        none = np.zeros(0)
-        return Map(variable.name, variable.unit, none, none, none, none, none, 0.0)
-    center, mean, sd, n = (np.array(c, dtype=float) for c in zip(*rows, strict=True))
-    independent = n * linearisation.band.independent_share[axis]
-    half = 1.96 * sd / np.sqrt(np.maximum(independent, 2.0))
-    share = float(np.sum(n * (mean - r.mean()) ** 2) / max(np.sum((r - r.mean()) ** 2), 1e-30))
-    return Map(variable.name, variable.unit, center, mean, mean - half, mean + half, n, share)
+    center, mean, sd, n = np.array(rows, dtype=float).reshape(-1, 4).T
+    half = 1.96 * sd / np.sqrt(np.maximum(n * linearisation.band.independent_share[axis], 2.0))
+    share = 0.0
+    if rows:
+        between, whole = np.sum(n * (mean - r.mean()) ** 2), np.sum((r - r.mean()) ** 2)
+        share = min(float(between) / max(float(whole), 1e-30), 1.0)
+    return ResidualMap.of(
+        unit=variable.unit, center=center, mean=mean, low=mean - half, high=mean + half,
+        count=n.astype(int), variance_share=share,
+    )  # fmt: skip
 
 
 def worst_windows(

@@ -89,23 +89,13 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
             return "(" + "*".join([factor] * int(exponent)) + ")"
         if exponent.is_Integer and exponent < 0:
             return f"(1.0/({self._print(base**-exponent)}))"
-        return self._print_power(self._print(base), self._print(exponent))
-
-    def _print_power(self, base: str, exponent: str) -> str:
-        return f"({base})**({exponent})"
+        return f"pow({self._print(base)}, {self._print(exponent)})"
 
     def _print_Rational(self, expr: Any) -> str:
         return f"({float(expr)!r})"
 
     def _print_Float(self, expr: Any) -> str:
         return repr(float(expr))
-
-
-class _PortablePrinter(_Printer):
-    """Prints powers as Python and C both take them."""
-
-    def _print_power(self, base: str, exponent: str) -> str:
-        return f"pow({base}, {exponent})"
 
 
 @dataclass(frozen=True)
@@ -176,13 +166,12 @@ def print_block(
     results: Sequence[Any],
     steps: Sequence[tuple[Any, Any]] = (),
     known: Sequence[Any] = (),
-    kind: type[_Printer] = _Printer,
 ) -> Block:
     """Return the text of ``results``, preceded by the ``steps`` that they need.
 
     Those in ``known`` have been assigned before.
     """
-    printer = kind()
+    printer = _Printer()
     used: set[Any] = set().union(*(sp.sympify(e, strict=True).free_symbols for e in results))
     needed = []
     for name, value in reversed(steps):
@@ -229,7 +218,7 @@ def print_portable(e: Equations, parameters: Mapping[Any, float]) -> Block:
     numbers = {symbol: sp.Float(value) for symbol, value in parameters.items()}
     required = [sp.sympify(force, strict=True).xreplace(numbers) for force in e.required]
     steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
-    return print_block(required, steps, kind=_PortablePrinter)
+    return print_block(required, steps)
 
 
 def array_source(e: Equations, added: Sequence[Any]) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
+import numpy as np
 import sympy as sp
 
 from bampipe.errors import InputError
@@ -337,9 +338,9 @@ def _apply_newton_euler(
     inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
     zeros = [0] * len(q)
     # Everything has a name: one compiled function serves every model of this robot.
-    mass = [[text.name(m) for m in row] for row in mass_matrix(text, links, inertial, q)]
+    mass = text.name(np.array(mass_matrix(text, links, inertial, q))).tolist()
     bias, dynamics = (
-        [text.name(f) for f in joint_forces(text, links, inertial, q, qd, a, gravity)]
+        text.name(joint_forces(text, links, inertial, q, qd, a, gravity))[:, 0].tolist()
         for a in (zeros, qdd)
     )
     return _Motion(text.steps, mass, bias, dynamics)

@@ -208,10 +208,12 @@ class Effect(DeclaredFile):
             yield InputError("'link' does not apply to kind 'energy'")
         if not self.expressions:
             yield InputError(f"an effect of kind {self.kind!r} needs {' or '.join(main)}")
-        names = [f"states.{state.name}" for state in self.states]
-        for where in (*names, *(f"definitions.{name}" for name in self.definitions)):
-            if where.partition(".")[2] in self.parameters:
-                yield InputError("a parameter has this name already", where=where)
+        taken = dict.fromkeys(self.parameters, "parameter")
+        names = [(state.name, "state") for state in self.states]
+        for name, kind in (*names, *((name, "definition") for name in self.definitions)):
+            if name in taken:
+                yield InputError(f"a {taken[name]} has this name already", where=f"{kind}s.{name}")
+            taken[name] = kind
 
     def targets(self, device: Device) -> tuple[str, ...]:
         """Names after the colon that make sense for ``device``; ``("",)`` for a device effect."""

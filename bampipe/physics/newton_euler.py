@@ -1,25 +1,30 @@
 """Recursive Newton-Euler equations of joints in a row or in a tree, written once.
 
 The same lines serve symbols and numbers: with sympy symbols and a `Text` that names every
-intermediate they become the text of generated code, with numpy arrays they are evaluated at once.
+intermediate they become the text of generated code, with numbers they are evaluated at once.
 All vectors of a link are in its own frame, at its joint; the inertia is about that point, so that
 every force is linear in the ten inertial numbers of a link (Atkeson, An and Hollerbach 1986).
-Gravity enters as an acceleration of the base (Luh, Walker and Paul 1980).
+Gravity enters as an acceleration of the base (Luh, Walker and Paul 1980). Vectors are (3, m) and
+matrices (3, 3, m), of m samples, or of one where all are equal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 Vector = tuple[Any, Any, Any]
+Columns = NDArray[Any]
+Entries = Sequence[Any] | Columns
 
-ZERO: Vector = (0, 0, 0)
 INERTIAL = 10
 """Inertial numbers of a link: mass, first moment x y z, inertia xx xy xz yy yz zz."""
+_TENSOR = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
+"""Place among them of each entry of the inertia."""
 
 
 @dataclass(frozen=True)
@@ -49,30 +54,42 @@ class Link:
 class Algebra:
     """The algebra of the equations, here of numbers or columns of numbers."""
 
+    kind: type = float
     sin: Any = staticmethod(np.sin)
     cos: Any = staticmethod(np.cos)
 
-    def name(self, value: Any) -> Any:
-        """Keep an intermediate."""
-        return value
+    def name(self, values: Columns) -> Columns:
+        """Keep intermediates."""
+        return values
+
+    def table(self, rows: Any) -> Columns:
+        """Return rows as an array; a row of a single entry, the same for all samples, as (1,)."""
+        found: Columns = np.array(rows, dtype=self.kind)
+        return found[:, None] if found.ndim == 1 else found
 
 
 class Text(Algebra):
     """Symbols: names of intermediates and their values, in the order in which they are needed."""
 
+    kind = object
+
     def __init__(self) -> None:
         import sympy as sp  # takes half a second, which derived code saves
 
-        self.sin, self.cos, self._symbol = sp.sin, sp.cos, sp.Symbol
+        self.sin, self.cos = (np.frompyfunc(f, 1, 1) for f in (sp.sin, sp.cos))
+        self._symbol, self._named = sp.Symbol, np.frompyfunc(self._name_entry, 1, 1)
         self.steps: list[tuple[Any, Any]] = []
         self._known: dict[Any, Any] = {}
 
-    def name(self, value: Any) -> Any:
-        """Return a symbol for ``value``; numbers, symbols and their negatives stay."""
+    def name(self, values: Columns) -> Columns:
+        """Return symbols for ``values``; numbers, symbols and their negatives stay."""
+        return np.asarray(self._named(values), dtype=object)
+
+    def _name_entry(self, value: Any) -> Any:
         if isinstance(value, int | float) or value.is_Symbol or value.is_Number:
             return value
         if value.is_Mul and len(value.args) == 2 and value.args[0] == -1:
-            return -self.name(-value)
+            return -self._name_entry(-value)
         if value not in self._known:
             self._known[value] = self._symbol(f"r_{len(self.steps)}")
             self.steps.append((self._known[value], value))
@@ -81,279 +98,218 @@ class Text(Algebra):
 
 @dataclass(frozen=True)
 class _LinkMotion:
-    """A link in motion: its rotation into the frame before, and its motion in its own frame.
+    """A link in motion: its place in the frame before, and its motion in its own frame.
 
     Attributes:
-        into_parent: vector of this frame into the frame before; from_parent: the reverse.
+        rotation, turn: matrices that rotate into the frame before, turn first.
         offset: from the joint before to this one, in the frame before.
         acceleration: of the joint, gravity in it. change: matrix W; W r is the acceleration of a
         point at r by rotation.
         rate, rate_change: angular velocity and acceleration.
     """
 
-    into_parent: Callable[[Vector], Vector]
-    from_parent: Callable[[Vector], Vector]
-    offset: Vector
-    acceleration: Vector
-    change: tuple[Vector, Vector, Vector]
-    rate: Vector
-    rate_change: Vector
+    rotation: Columns
+    turn: Columns
+    offset: Columns
+    acceleration: Columns
+    change: Columns
+    rate: Columns
+    rate_change: Columns
+
+    def into_parent(self, vector: Columns) -> Columns:
+        """Return a vector of this frame in the frame before."""
+        return _multiply(self.rotation, _multiply(self.turn, vector))
+
+    def from_parent(self, a: Algebra, vector: Columns) -> Columns:
+        """Return a vector of the frame before in this one."""
+        middle = a.name(_multiply(self.rotation.swapaxes(0, 1), vector))
+        return _multiply(self.turn.swapaxes(0, 1), middle)
 
 
 def joint_forces(
     algebra: Algebra,
     links: Sequence[Link],
     inertial: Sequence[Sequence[Any]],
-    q: Sequence[Any],
-    qd: Sequence[Any],
-    qdd: Sequence[Any],
-    gravity: Vector,
-) -> list[Any]:
+    q: Entries,
+    qd: Entries,
+    qdd: Entries,
+    gravity: Entries,
+) -> Columns:
     """Return the generalised force of each joint that a motion requires, N.m or N.
 
     Args:
         algebra: symbols or numbers.
         links: parents before children.
         inertial: by link, mass, first moment and inertia about the joint, ten numbers, SI.
-        q, qd, qdd: by joint that follows no other, rad or m and derivatives.
-        gravity: m/s2 in the frame of the base.
+        q, qd, qdd: by joint that follows no other, rad or m and derivatives, one or m entries each.
+        gravity: m/s2 in the frame of the base, three numbers or (3, m).
 
     Returns:
-        Those of the same joints.
+        Those of the same joints, (joints, m).
     """
     a, moving = algebra, _link_motions(algebra, links, q, qd, qdd, gravity)
     force, moment = [], []
-    for at, (mass, *rest) in zip(moving, inertial, strict=True):
-        first, inertia = (rest[0], rest[1], rest[2]), _symmetric_matrix(rest[3:])
-        force.append(
-            _name_components(a, _add(_scale(mass, at.acceleration), _multiply(at.change, first)))
-        )
-        spin = _name_components(a, _multiply(inertia, at.rate))
-        turning = _multiply(inertia, at.rate_change), _cross(at.rate, spin)
-        moment.append(_name_components(a, _add(*turning, _cross(first, at.acceleration))))
+    for at, numbers in zip(moving, map(a.table, inertial), strict=True):
+        first, inertia = numbers[1:4], numbers[_TENSOR]
+        force.append(a.name(numbers[0] * at.acceleration + _multiply(at.change, first)))
+        spin = a.name(_multiply(inertia, at.rate))
+        turning = _multiply(inertia, at.rate_change) + _cross(at.rate, spin)
+        moment.append(a.name(turning + _cross(first, at.acceleration)))
     results: list[Any] = [0] * len(links)
     for i in reversed(range(len(links))):
-        results[i] = a.name(_dot(links[i].axis, force[i] if links[i].slides else moment[i]))
+        along = force[i] if links[i].slides else moment[i]
+        results[i] = a.name(_dot(a.table(links[i].axis), along))
         parent = links[i].parent
         if parent >= 0:
-            onward = _name_components(a, moving[i].into_parent(force[i]))
-            force[parent] = _name_components(a, _add(force[parent], onward))
-            turned = moving[i].into_parent(moment[i])
+            onward = a.name(moving[i].into_parent(force[i]))
+            force[parent] = a.name(force[parent] + onward)
             lever = _cross(moving[i].offset, onward)
-            moment[parent] = _name_components(a, _add(moment[parent], turned, lever))
-    return [
-        a.name(sum(ratio * results[i] for i, ratio in turned))
-        if len(turned) > 1
-        else results[turned[0][0]]
-        for turned in _list_turned_links(links)
+            moment[parent] = a.name(moment[parent] + moving[i].into_parent(moment[i]) + lever)
+    return a.name(a.table(_gears(links).T) @ np.array(np.broadcast_arrays(*results)))
+
+
+def _gears(links: Sequence[Link]) -> Columns:
+    """Motion of each link's joint for one of each joint that follows no other, (links, joints)."""
+    alone = [i for i, link in enumerate(links) if link.follows < 0]
+    ratios = [
+        [1 if i == k else link.ratio if link.follows == k else 0 for k in alone]
+        for i, link in enumerate(links)
     ]
-
-
-def _list_turned_links(links: Sequence[Link]) -> list[list[tuple[int, float]]]:
-    """By joint that follows no other: the links that it moves, itself first, with their ratios."""
-    return [
-        [(i, 1.0), *((k, link.ratio) for k, link in enumerate(links) if link.follows == i)]
-        for i, own in enumerate(links)
-        if own.follows < 0
-    ]
-
-
-def _extend_to_links(links: Sequence[Link], values: Sequence[Any], position: bool) -> list[Any]:
-    """Positions, or their derivatives, of all joints by those of joints that follow no other."""
-    results: list[Any] = [0] * len(links)
-    for turned, value in zip(_list_turned_links(links), values, strict=True):
-        for i, ratio in turned:
-            results[i] = value if i == turned[0][0] else ratio * value
-            if position and links[i].follows >= 0:
-                results[i] = results[i] + links[i].zero
-    return results
+    return np.array(ratios, dtype=object).reshape(len(links), len(alone))
 
 
 def columns(
     links: Sequence[Link],
-    q: Sequence[Any],
-    qd: Sequence[Any],
-    qdd: Sequence[Any],
-    gravity: Vector,
-) -> list[list[list[Any]]]:
-    """Return what one of each inertial number adds to each joint's force: [joint][link][number].
+    q: Entries,
+    qd: Entries,
+    qdd: Entries,
+    gravity: Entries,
+) -> list[list[Any]]:
+    """Return what one of each inertial number adds to each joint's force: [joint][link], (10, m).
 
     Arguments as in `joint_forces`, of numbers.
     """
-    moving = _link_motions(Algebra(), links, q, qd, qdd, gravity)
-    results: list[list[list[Any]]] = [[[0] * INERTIAL for _ in links] for _ in links]
-    felt: list[dict[int, tuple[Vector, Vector]]] = []
+    a, n = Algebra(), len(links)
+    moving = _link_motions(a, links, q, qd, qdd, gravity)
+    results: list[list[Any]] = [[np.zeros((INERTIAL, 1)) for _ in links] for _ in links]
+    felt: list[dict[int, tuple[Columns, Columns]]] = []
     for i, (link, at) in enumerate(zip(links, moving, strict=True)):
         # Effect of a moment and a force at this joint on each joint before it, in this frame.
-        here: dict[int, tuple[Vector, Vector]] = {}
+        here: dict[int, tuple[Columns, Columns]] = {}
         for j, (turn, push) in felt[link.parent].items() if link.parent >= 0 else ():
-            onward = _add(push, _cross(turn, at.offset))
-            here[j] = at.from_parent(turn), at.from_parent(onward)
-        here[i] = (ZERO, link.axis) if link.slides else (link.axis, ZERO)
+            onward = push + _cross(turn, at.offset)
+            here[j] = at.from_parent(a, turn), at.from_parent(a, onward)
+        axis, zero = a.table(link.axis), np.zeros((3, 1))
+        here[i] = (zero, axis) if link.slides else (axis, zero)
         felt.append(here)
-        by_number = _unit_wrenches(at)
+        force, moment = _unit_wrenches(at)
         for j, (turn, push) in here.items():
-            results[j][i] = [_dot(turn, moment) + _dot(push, force) for force, moment in by_number]
-    table: list[list[list[Any]]] = []
-    for (first, _), *others in _list_turned_links(links):
-        rows = results[first]
-        for i, ratio in others:
-            pairs = [zip(*both, strict=True) for both in zip(rows, results[i], strict=True)]
-            rows = [[x + ratio * y for x, y in numbers] for numbers in pairs]
-        table.append(rows)
-    return table
+            results[j][i] = _dot(turn[:, None], moment) + _dot(push[:, None], force)
+    return [
+        [sum(ratio * results[k][i] for k, ratio in enumerate(gear) if ratio) for i in range(n)]
+        for gear in _gears(links).T
+    ]
 
 
-def _unit_wrenches(at: _LinkMotion) -> list[tuple[Vector, Vector]]:
-    """Force and moment at the joint by each inertial number of the link."""
-    x, y, z = at.rate
-    dx, dy, dz = at.rate_change
-    units: list[Vector] = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
-    results: list[tuple[Vector, Vector]] = [(at.acceleration, ZERO)]
-    results += [(_multiply(at.change, e), _cross(e, at.acceleration)) for e in units]
-    moments: list[Vector] = [
-        (dx, x * z, -x * y), (dy - x * z, dx + y * z, x * x - y * y),
-        (dz + x * y, z * z - x * x, dx - y * z), (-y * z, dy, x * y),
-        (y * y - z * z, dz - x * y, dy + x * z), (y * z, -x * z, dz),
-    ]  # fmt: skip
-    return results + [(ZERO, moment) for moment in moments]
+def _unit_wrenches(at: _LinkMotion) -> tuple[Columns, Columns]:
+    """Force and moment at the joint by each inertial number of the link, (3, 10, m) each."""
+    rate, rate_change, along = np.broadcast_arrays(at.rate, at.rate_change, at.acceleration)
+    (x, y, z), (dx, dy, dz), (ax, ay, az) = rate, rate_change, along
+    none = np.zeros_like(x)
+    force = np.zeros((3, INERTIAL, len(none)))
+    force[:, 0], force[:, 1:4] = along, at.change
+    moment = np.array([
+        [none, none, az, -ay, dx, dy - x * z, dz + x * y, -y * z, y * y - z * z, y * z],
+        [none, -az, none, ax, x * z, dx + y * z, z * z - x * x, dy, dz - x * y, -x * z],
+        [none, ay, -ax, none, -x * y, x * x - y * y, dx - y * z, x * y, dy + x * z, dz],
+    ])  # fmt: skip
+    return force, moment
 
 
 def mass_matrix(
-    algebra: Algebra, links: Sequence[Link], inertial: Sequence[Sequence[Any]], q: Sequence[Any]
+    algebra: Algebra, links: Sequence[Link], inertial: Sequence[Sequence[Any]], q: Entries
 ) -> list[list[Any]]:
     """Return the mass matrix: column by column, the forces of a unit acceleration at rest."""
     n = len(q)
     mass: list[list[Any]] = [[0] * n for _ in range(n)]
     for j in range(n):
         unit = [int(i == j) for i in range(n)]
-        forces = joint_forces(algebra, links, inertial, q, [0] * n, unit, ZERO)
+        forces = joint_forces(algebra, links, inertial, q, [0] * n, unit, (0, 0, 0))
         for i in range(j + 1):
-            mass[i][j] = mass[j][i] = forces[i]
+            mass[i][j] = mass[j][i] = forces[i, 0]
     return mass
 
 
 def _link_motions(
     a: Algebra,
     links: Sequence[Link],
-    q: Sequence[Any],
-    qd: Sequence[Any],
-    qdd: Sequence[Any],
-    gravity: Vector,
+    q: Entries,
+    qd: Entries,
+    qdd: Entries,
+    gravity: Entries,
 ) -> list[_LinkMotion]:
+    still, gears = a.table([0, 0, 0]), a.table(_gears(links))
+    square = still[:, None] * still
+    base = _LinkMotion(square, square, still, -a.table(gravity), square, still, still)
+    follow = a.table([link.zero if link.follows >= 0 else 0 for link in links])
+    of_all = gears @ a.table(q) + follow, gears @ a.table(qd), gears @ a.table(qdd)
     results: list[_LinkMotion] = []
-    still: tuple[Vector, Vector, Vector] = (ZERO, ZERO, ZERO)
-    of_all = (_extend_to_links(links, values, k == 0) for k, values in enumerate((q, qd, qdd)))
     for link, x, v, w in zip(links, *of_all, strict=True):
-        if link.parent >= 0:
-            before = results[link.parent]
-            rate, rate_change, change = before.rate, before.rate_change, before.change
-            acceleration = before.acceleration
-        else:
-            rate, rate_change, change = ZERO, ZERO, still
-            acceleration = _scale(-1, gravity)
-        turn = _joint_rotation(a, link, x)
-
-        def into(vector: Vector, link: Link = link, turn: Any = turn) -> Vector:
-            return _multiply(link.rotation, _multiply(turn, vector))
-
-        def out(vector: Vector, link: Link = link, turn: Any = turn) -> Vector:
-            middle = _name_components(a, _multiply(_transpose(link.rotation), vector))
-            return _multiply(_transpose(turn), middle)
-
-        axis_before = _multiply(link.rotation, link.axis)
-        offset = link.position
+        before = results[link.parent] if link.parent >= 0 else base
+        rotation, turn = a.table(link.rotation)[..., None], _joint_rotation(a, link, x)
+        axis, offset = a.table(link.axis), a.table(link.position)
         if link.slides:
-            offset = _name_components(a, _add(offset, _scale(x, axis_before)))
-        here = _name_components(
-            a, out(_name_components(a, _add(acceleration, _multiply(change, offset))))
-        )
-        own, own_change = _name_components(a, out(rate)), out(rate_change)
+            offset = a.name(offset + x * _multiply(rotation, axis))
+        at = replace(base, rotation=rotation, turn=turn, offset=offset)
+        at_joint = a.name(before.acceleration + _multiply(before.change, offset))
+        here = a.name(at.from_parent(a, at_joint))
+        own = a.name(at.from_parent(a, before.rate))
+        own_change = at.from_parent(a, before.rate_change)
         if link.slides:
-            along = _scale(2 * v, _cross(own, link.axis))
-            here = _name_components(a, _add(here, _scale(w, link.axis), along))
-            own_change = _name_components(a, own_change)
+            here = a.name(here + w * axis + 2 * v * _cross(own, axis))
+            own_change = a.name(own_change)
         else:
-            twist = _scale(v, _cross(own, link.axis))
-            own_change = _name_components(a, _add(own_change, twist, _scale(w, link.axis)))
-            own = _name_components(a, _add(own, _scale(v, link.axis)))
-        results.append(
-            _LinkMotion(
-                into, out, offset, here, _acceleration_matrix(a, own, own_change), own, own_change
-            )
-        )
+            own_change = a.name(own_change + v * _cross(own, axis) + w * axis)
+            own = a.name(own + v * axis)
+        change = _acceleration_matrix(a, own, own_change)
+        motion = {"acceleration": here, "change": change, "rate": own, "rate_change": own_change}
+        results.append(replace(at, **motion))
     return results
 
 
-def _joint_rotation(a: Algebra, link: Link, x: Any) -> tuple[Vector, Vector, Vector]:
+def _joint_rotation(a: Algebra, link: Link, x: Columns) -> Columns:
     """Rotation about the joint's axis (Rodrigues); its columns are the turned axes."""
     if link.slides:
-        return (1, 0, 0), (0, 1, 0), (0, 0, 1)
-    s, c = a.name(a.sin(x)), a.name(a.cos(x))
-    k = link.axis
+        return a.table(np.eye(3, dtype=int))[..., None]
+    s, c, k = a.name(a.sin(x)), a.name(a.cos(x)), link.axis
     spin = ((0, -k[2], k[1]), (k[2], 0, -k[0]), (-k[1], k[0], 0))
-    rows = []
-    for i in range(3):
-        row = []
-        for j in range(3):
-            square = k[i] * k[j]
-            # For an axis along x, y or z only 0, 1, s and c remain.
-            value = square if square in (0, 1) else square * (1 - c)
-            if i == j and square != 1:
-                value = value + c
-            row.append(a.name(value + spin[i][j] * s) if spin[i][j] != 0 else a.name(value))
-        rows.append((row[0], row[1], row[2]))
-    return rows[0], rows[1], rows[2]
+
+    def entry(i: int, j: int) -> Columns:
+        square = k[i] * k[j]
+        # For an axis along x, y or z only 0, 1, s and c remain.
+        value = square + 0 * c if square in (0, 1) else square * (1 - c)
+        return np.asarray(value + int(i == j and square != 1) * c + spin[i][j] * s)
+
+    return a.name(np.array([[entry(i, j) for j in range(3)] for i in range(3)]))
 
 
-def _acceleration_matrix(
-    a: Algebra, rate: Vector, rate_change: Vector
-) -> tuple[Vector, Vector, Vector]:
-    x, y, z = rate
+def _acceleration_matrix(a: Algebra, rate: Columns, rate_change: Columns) -> Columns:
     dx, dy, dz = rate_change
-    xx, yy, zz = a.name(x * x), a.name(y * y), a.name(z * z)
-    xy, xz, yz = a.name(x * y), a.name(x * z), a.name(y * z)
-    return (
-        _name_components(a, (-yy - zz, xy - dz, xz + dy)),
-        _name_components(a, (xy + dz, -xx - zz, yz - dx)),
-        _name_components(a, (xz - dy, yz + dx, -xx - yy)),
+    (xx, xy, xz), (_, yy, yz), (*_, zz) = a.name(rate[:, None] * rate)
+    rows = [-yy - zz, xy - dz, xz + dy], [xy + dz, -xx - zz, yz - dx], [xz - dy, yz + dx, -xx - yy]
+    return a.name(np.array(rows))
+
+
+def _dot(one: Columns, other: Columns) -> Columns:
+    return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
+
+
+def _multiply(matrix: Columns, vector: Columns) -> Columns:
+    return np.asarray(
+        matrix[:, 0] * vector[0] + matrix[:, 1] * vector[1] + matrix[:, 2] * vector[2]
     )
 
 
-def _name_components(a: Algebra, vector: Vector) -> Vector:
-    return a.name(vector[0]), a.name(vector[1]), a.name(vector[2])
-
-
-def _symmetric_matrix(values: Sequence[Any]) -> tuple[Vector, Vector, Vector]:
-    xx, xy, xz, yy, yz, zz = values
-    return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
-
-
-def _dot(one: Vector, other: Vector) -> Any:
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
-
-
-def _multiply(matrix: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
-    return _dot(matrix[0], vector), _dot(matrix[1], vector), _dot(matrix[2], vector)
-
-
-def _transpose(matrix: tuple[Vector, Vector, Vector]) -> tuple[Vector, Vector, Vector]:
-    first, second, third = zip(*matrix, strict=True)
-    return first, second, third
-
-
-def _scale(factor: Any, vector: Vector) -> Vector:
-    return factor * vector[0], factor * vector[1], factor * vector[2]
-
-
-def _add(*vectors: Vector) -> Vector:
-    first, second, third = (sum(parts[1:], parts[0]) for parts in zip(*vectors, strict=True))
-    return first, second, third
-
-
-def _cross(one: Vector, other: Vector) -> Vector:
-    return (
-        one[1] * other[2] - one[2] * other[1],
-        one[2] * other[0] - one[0] * other[2],
-        one[0] * other[1] - one[1] * other[0],
-    )
+def _cross(one: Columns, other: Columns) -> Columns:
+    (a, b, c), (x, y, z) = one, other
+    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])

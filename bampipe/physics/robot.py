@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import cached_property
-from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -259,8 +258,9 @@ class Robot(Declaration):
         n, moving = len(self.joints), len(self.moving)
         samples = 40 * max(n, 1)
         entries = self.columns(*(rng.uniform(-2.0, 2.0, (moving, samples)).T for _ in range(3)))
-        table = np.array([[np.broadcast_to(c, samples) for c in chain(*row)] for row in entries])
-        return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
+        shape = INERTIAL, samples
+        table = [np.concatenate([np.broadcast_to(x, shape) for x in row]).T for row in entries]
+        return np.ascontiguousarray(np.concatenate(table))
 
     def describe_mass(self, place: int, factor: float) -> str:
         """Say that the drives suggest ``factor`` times the drawn mass of a body, and the remedy.
@@ -277,16 +277,16 @@ class Robot(Declaration):
         more = (factor - 1.0) * joint.mass
         return f"{said}: a tool of about {more:.2g} kg? put it into [robot.payload]"
 
-    def columns(self, q: Array, qd: Array, qdd: Array) -> list[list[list[Any]]]:
-        """Forces of the joints by one unit of each inertial number: [joint][link][number].
+    def columns(self, q: Array, qd: Array, qdd: Array) -> list[list[Array]]:
+        """Forces of the joints by one unit of each inertial number: [joint][link].
 
         Args:
             q, qd, qdd: a motion of `moving`, (T, joints), rad or m and derivatives.
 
         Returns:
-            Numbers, or (T,) where they differ, N.m or N.
+            (10, T), or (10, 1) where all samples are equal, N.m or N.
         """
-        a, b, c = (list(np.ascontiguousarray(x.T)) for x in (q, qd, qdd))
+        a, b, c = (np.ascontiguousarray(x.T) for x in (q, qd, qdd))
         return columns(self.links, a, b, c, gravity_vector(self))
 
     def drawn_forces(
@@ -303,10 +303,9 @@ class Robot(Declaration):
             list(joint.inertial) if only in (None, k) else [0.0] * INERTIAL
             for k, joint in enumerate(self.joints)
         ]
-        a, b, c = (list(np.ascontiguousarray(part.T)) for part in (q, qd, qdd))
-        down = (gravity[0], gravity[1], gravity[2])
-        forces = joint_forces(Algebra(), self.links, bodies, a, b, c, down)
-        return np.column_stack([np.broadcast_to(force, len(q)) for force in forces])
+        a, b, c = (np.ascontiguousarray(part.T) for part in (q, qd, qdd))
+        forces = joint_forces(Algebra(), self.links, bodies, a, b, c, gravity)
+        return np.broadcast_to(forces, (len(forces), len(q))).T.copy()
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -28,7 +28,7 @@ from bampipe.physics import compile_model, registry
 from bampipe.physics.effect import effect_from
 from bampipe.physics.model_spec import ModelSpec
 from bampipe.progress import Progress
-from bampipe.results.diagnose import DiagnoseResult, ResidualMap
+from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
 from bampipe.results.terms import EffectText
@@ -167,8 +167,8 @@ def _result(
     known = sorted({entry.effect.partition(":")[0] for entry in ranking[:_DESCRIBED]})
     maps = {}
     for i, axis in enumerate(names):
-        binned = (residual_map(given, i, one) for one in variables(given.fitted, given.band, i))
-        maps[axis] = {m.variable: ResidualMap.of(m, variance_share=m.share) for m in binned}
+        known_here = variables(given.fitted, given.band, i)
+        maps[axis] = {one.name: residual_map(given, i, one) for one in known_here}
     result = DiagnoseResult(
         model=config.model,
         trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in session.trials.weighed)),

@@ -231,27 +231,26 @@ class ModelOnTrial:
         """Internal states, (T, n_z)."""
         return self.mechanism.memory(self.system, self.p)
 
+    @property
+    def _arguments(self) -> tuple[Array, ...]:
+        return (*self.mechanism.kinematics, self.memory, self.inputs, self.p)
+
     @cached_property
     def residual(self) -> Array:
         """The residual before the low-pass, (T, n_q), N.m or N."""
-        at = self.mechanism.kinematics
-        return self.system.residual(*at, self.memory, self.inputs, self.p)
+        return self.system.residual(*self._arguments)
 
     @property
     def applied(self) -> Array:
         """Generalised force of the measured input, before the low-pass, (T, n_q), N.m or N."""
-        at = self.mechanism.kinematics
-        return self.system.applied(*at, self.memory, self.inputs, self.p)
+        return self.system.applied(*self._arguments)
 
     @property
     def residual_once(self) -> Array:
         """`residual` by functions that need no compilation, for a model that is seen only once."""
-        at = self.mechanism.kinematics
-        required = self.system.required(*at, self.memory, self.inputs, self.p)
-        return self.applied - required
+        return self.applied - self.system.required(*self._arguments)
 
     @cached_property
     def contribution(self) -> Array:
         """Contribution of the effects to the residual, see `System.contribution`, (T, n_q)."""
-        at = self.mechanism.kinematics
-        return self.system.contribution(*at, self.memory, self.inputs, self.p)
+        return self.system.contribution(*self._arguments)

@@ -65,8 +65,8 @@ def test_strengths_stay_within_bounds_and_a_shape_moves_to_its_truth(search):
             for key, strengths in zip(
                 added_effects(keys), search.solve(keys).strengths, strict=True
             ):
-                for value, (low, high) in zip(
-                    strengths, search.dictionary.bounds(key[0]), strict=True
+                for value, (low, high, _) in zip(
+                    strengths, search.dictionary.priors(key[0]), strict=True
                 ):
                     assert low - 1e-9 <= value <= high + 1e-9
     others = tuple(key for key in best_set(search, 3) if key[0] != "stribeck:yaw")

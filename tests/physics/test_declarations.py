@@ -99,6 +99,7 @@ EFFECTS = [
     ("parameters.force.rotary.sd", 1e300, "sd: beyond what can be computed with"),
     ("states.z", {}, "states.z"),
     ("states.force", {"rate": "qd"}, "already"),
+    ("definitions.force", "qd", "definitions.force: a parameter has this name already"),
     ("states.z = 0; import os", {"rate": "qd"}, "cannot be a name"),
     ("states.z", {"rate": "qd", "initial": "qd"}, "initial value"),
     ("states.z", {"rate": "ddt(qd)"}, "rate of an internal state"),
@@ -114,6 +115,12 @@ def test_wrong_effect_file_is_refused_with_its_field(path, value, says):
         effect = registry.effect_from(entries, "lab.toml")
         compile_model(Model(BAM, ("stribeck:yaw",), (effect,)))
     assert says in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_definition_hides_no_state():
+    entries = stribeck() | {"states": {"z": {"rate": "qd"}}, "definitions": {"z": "qd"}}
+    with pytest.raises(InputError, match=r"definitions\.z: a state has this name already"):
+        registry.effect_from(entries)
 
 
 OFFSETS = ["error*qd", "error*ddt(qd)", "error*brake", "error*ddt(f)", "error*sgn(q)*log(q - q)"]

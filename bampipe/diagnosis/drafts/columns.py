@@ -104,15 +104,11 @@ class FormDictionary:
         limits, kinds = form.limits().items(), form.shape.searched
         return [(n, low, high, kinds[n] in by_ratio) for n, (low, high, _) in limits]
 
-    def bounds(self, name: str) -> list[tuple[float, float]]:
-        """Return the bounds of each strength of a form, which are infinite."""
-        return [(-np.inf, np.inf)] * len(self.candidates[name].shape.strengths)
-
-    def spreads(self, name: str) -> list[float]:
-        """Return the prior standard deviation of each strength, that of the applied force."""
+    def priors(self, name: str) -> list[tuple[float, float, float]]:
+        """Return infinite bounds of each strength of a form, and the applied force as its sd."""
         form = self.candidates[name]
         size = self._sizes[form.coordinate.words if form.factor == forms.READING else _LOAD]
-        return [max(size, 1e-300)] * len(form.shape.strengths)
+        return [(-np.inf, np.inf, max(size, 1e-300))] * len(form.shape.strengths)
 
     def make(self, key: Key) -> Atom | None:
         """Compute a form at one shape; None if it has no effect in these trials."""

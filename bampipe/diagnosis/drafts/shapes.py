@@ -7,6 +7,7 @@ import ast
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -65,39 +66,26 @@ class Shape:
             constants: searched and fixed constants, and the ``interval`` of samples, s.
             is_quick: whether the motion is too quick for the states to relax.
         """
-        known = dict(constants) | {f"x{k + 1}" if k else "x": c for k, c in enumerate(x.T)}
+        # As numpy's number, a constant of zero divides like one of a column.
+        known: dict[str, Any] = {name: np.float64(value) for name, value in constants.items()}
+        known |= {f"x{k + 1}" if k else "x": column for k, column in enumerate(x.T)}
         for name, state in self.states.items():
             known[name] = (state.quick_course if is_quick else state.course)(x[:, 0], known)
-        tree, nothing = _parsed(self.text), dict.fromkeys(self.strengths, 0.0)
-        values = [_evaluate(tree, known | nothing | {name: 1.0}) for name in self.strengths]
+        code, known = _compile(self.text), known | dict.fromkeys(self.strengths, 0.0)
+        values = [eval(code, _FUNCTIONS, known | {name: 1.0}) for name in self.strengths]
         return np.column_stack([np.broadcast_to(value, len(x)) for value in values])
 
 
-_parsed = cache(lambda text: parse(text, "a shape"))
-_OPERATORS: Mapping[type, Callable[[Any, Any], Any]] = {
-    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
-    ast.Pow: np.power,
-}  # fmt: skip
-_FUNCTIONS: Mapping[str, Callable[..., Any]] = {
+@cache
+def _compile(text: str) -> CodeType:
+    """Return the code of an expression whose every node is checked, as in an effect file."""
+    return compile(ast.Expression(parse(text, "a shape")), text, "eval")
+
+
+_FUNCTIONS: dict[str, Any] = {
     "exp": np.exp, "tanh": np.tanh, "sin": np.sin, "cos": np.cos, "abs": np.abs,
-    "max": np.maximum, "min": np.minimum, "clip": np.clip,
+    "max": np.maximum, "min": np.minimum, "clip": np.clip, "__builtins__": {},
 }  # fmt: skip
-
-
-def _evaluate(node: ast.AST, known: Constants) -> Any:
-    """Return the value of a checked expression."""
-    match node:
-        case ast.Constant(value=value):
-            return float(value)  # type: ignore[arg-type]
-        case ast.Name(id=name):
-            return known[name]
-        case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return -_evaluate(operand, known)
-        case ast.BinOp(left=left, op=op, right=right):
-            return _OPERATORS[type(op)](_evaluate(left, known), _evaluate(right, known))
-        case ast.Call(func=ast.Name(id=name), args=args):
-            return _FUNCTIONS[name](*(_evaluate(argument, known) for argument in args))
-    raise AssertionError(f"unchecked node {type(node).__name__}")
 
 
 def _lagged(x: Array, c: Constants, first: float) -> Array:
