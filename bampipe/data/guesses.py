@@ -88,16 +88,6 @@ def likely_unit(si: str, values: np.ndarray) -> str:
     return other if other and span > limit else ""
 
 
-def interval_of(name: str, value: float) -> float:
-    """Sampling interval, s, that a number beside the samples gives (``Ts``, ``fs``), else 0."""
-    plain = re.sub(r"[\W_]|hz$", "", name.lower().rpartition(".")[2])
-    if value > 0.0 and plain in ("ts", "dt", "tsample", "sampletime", "samplingtime"):
-        return value
-    if value > 0.0 and re.fullmatch("fs(ample)?|sampl(e|ing)(rate|freq|frequency)", plain):
-        return 1.0 / value
-    return 0.0
-
-
 def sample_rate(t: np.ndarray) -> float:
     """Rate of time stamps ``t`` (T,), s, in Hz: a round number where one is within 1 %."""
     rate = rate_of(t[np.isfinite(t)])
