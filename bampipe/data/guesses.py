@@ -1,7 +1,6 @@
 """Guesses from the data themselves: units, rates, what a column is, and what drives what."""
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

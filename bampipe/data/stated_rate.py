@@ -27,7 +27,8 @@ _NOTES = (
 )
 """File extensions of what is written about logs."""
 _STATEMENT = re.compile(
-    r"(?P<name>[A-Za-z][\w .-]*?)\s*(?:[\[(](?P<of>[^\])\d]*)[\])])?[\"']?\s*[=:;,\t ]{1,3}\s*[\"']?"
+    r"(?P<name>[A-Za-z][\w .-]*?)\s*(?:[\[(](?P<of>[^\])\d]*)[\])])?"
+    r"[\"']?\s*[=:;,\t ]{1,3}\s*[\"']?"
     rf"(?P<value>{NUMBER})[ \t]*[\[(]?(?P<unit>[A-Za-z]+(?:/s)?)?"
 )
 _SAMPLES = r"(?:data|sampl\w*|abtast|scan|acquisition|logging|log|recording|frame)"

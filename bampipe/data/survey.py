@@ -50,8 +50,8 @@ _RISES = 0.8
 _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 """Words in the name of a column that say less of it than the name of its file."""
 _WORDS = {
-    "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs msec usec"
-    " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
+    "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
+    " msec usec nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
     " tid czas cas zaman aika ido ipoc timer",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
     " wanted con ctrl action ziel consigne consigna referencia riferimento planned requested",
