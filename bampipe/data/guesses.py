@@ -1,7 +1,6 @@
 """Guesses from the data themselves: units, rates, what a column is, and what drives what."""
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -86,16 +85,6 @@ def likely_unit(si: str, values: np.ndarray) -> str:
     span = float(np.ptp(known)) if len(known) else 0.0
     limit, other = {"rad": (62.8, "deg"), "m": (5.0, "mm"), "A": (100.0, "mA")}.get(si, (0, ""))
     return other if other and span > limit else ""
-
-
-def interval_of(name: str, value: float) -> float:
-    """Sampling interval, s, that a number beside the samples gives (``Ts``, ``fs``), else 0."""
-    plain = re.sub(r"[\W_]|hz$", "", name.lower().rpartition(".")[2])
-    if value > 0.0 and plain in ("ts", "dt", "tsample", "sampletime", "samplingtime"):
-        return value
-    if value > 0.0 and re.fullmatch("fs(ample)?|sampl(e|ing)(rate|freq|frequency)", plain):
-        return 1.0 / value
-    return 0.0
 
 
 def sample_rate(t: np.ndarray) -> float:

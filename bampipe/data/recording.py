@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
+from bampipe.data.quality.clock import SEAM, unroll
 from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, check_columns, interpolated
@@ -180,18 +181,26 @@ def starts_of(raw: RawTrial, clock: str) -> list[int]:
         ahead = {at: float(t[at] - t[at - 1]) for at in raw.begun}
         usual = float(np.nanmedian(np.diff(t))) if len(t) > 1 else 0.0
         starts -= {at for at, step in ahead.items() if 0.0 < step < _PAGE * usual}
-        begin = 0
-        for at in np.flatnonzero(np.diff(t) < 0.0) + 1:
+        begin, rolled = 0, unroll(t)[2]
+        moving = [values for name, values in raw.columns.items() if name != clock]
+        # A counter goes on, and so does what it is the time of.
+        rolls = bool(len(rolled)) and all(_goes_on(values, rolled) for values in moving)
+        for at in () if rolls else np.flatnonzero(np.diff(t) < 0.0) + 1:
             begin = max([start for start in starts if start <= at], default=begin)
             passed = t[at - 1] - t[begin]
-            turned = -np.diff(t[at - 1 : at + 1])[0] > 0.9 * 2.0**32  # a counter, not a clock
             goes_on = len(t) - at >= _LEAST and bool(np.all(np.diff(t[at : at + _LEAST]) > 0.0))
             back = abs(t[at] - t[begin]) <= _BACK * passed
             # A lone stamp that is wrong leaves those around it in order.
             stays = at >= 2 and at + 1 < len(t) and bool(t[at + 1] < t[at - 2])
-            if at - begin >= _LEAST and back and goes_on and stays and not turned:
+            if at - begin >= _LEAST and back and goes_on and stays:
                 starts.add(int(at))
     return sorted(starts)
+
+
+def _goes_on(values: np.ndarray, rows: np.ndarray) -> bool:
+    """Whether readings (T,) change before ``rows`` no more than anywhere else."""
+    steps = np.abs(np.diff(np.nan_to_num(values)))
+    return bool(np.max(steps[rows - 1]) <= SEAM * np.max(np.delete(steps, rows - 1), initial=0.0))
 
 
 def _place(column: str, entry: TrialEntry) -> tuple[str, str]:
@@ -337,9 +346,10 @@ def read_sound_trial(
     )
     if clock.nanoseconds:
         columns = dict(raw.columns)
-        seconds, nanoseconds = columns[clock.column], columns.pop(clock.nanoseconds)
+        seconds, fraction = columns[clock.column], columns.pop(clock.nanoseconds)
         # Seconds since 1970 leave no room for nanoseconds in a double: the first goes first.
-        columns[clock.column] = seconds - np.fmin.reduce(seconds) + SECONDS["ns"] * nanoseconds
+        columns[clock.column] = seconds - np.fmin.reduce(seconds)
+        columns[clock.column] += SECONDS[clock.fraction_unit] * fraction
         raw = replace(raw, columns=columns)
     if not clock.column:
         count = len(raw.columns[session.columns[0]])

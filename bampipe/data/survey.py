@@ -19,6 +19,7 @@ from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS
 from bampipe.data.session.file import lexically_inside
+from bampipe.data.stated_rate import intervals_stated
 from bampipe.data.units import RecordedUnit, spelled, unit
 from bampipe.errors import InputError
 from bampipe.lists import join_names
@@ -50,7 +51,7 @@ _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 """Words in the name of a column that say less of it than the name of its file."""
 _WORDS = {
     "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
-    " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
+    " msec usec nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
     " tid czas cas zaman aika ido ipoc timer",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
     " wanted con ctrl action ziel consigne consigna referencia riferimento planned requested",
@@ -184,12 +185,15 @@ class Survey:
         columns: what they hold, from the first of them.
         remarks: what was guessed about them, a sentence each.
         passed: other files, and why each is left out.
+        intervals: between samples, s, that files state where no column has the time, by file and
+            name of the number.
     """
 
     trials: tuple[TrialEntry, ...]
     columns: tuple[SurveyedColumn, ...]
     remarks: tuple[str, ...]
     passed: tuple[tuple[str, str], ...]
+    intervals: Mapping[str, float] = field(default_factory=dict)
 
     def of(self, *roles: str) -> list[SurveyedColumn]:
         """The columns with one of these roles."""
@@ -228,7 +232,9 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     )
     if dataset is not None:
         logs.remarks = [lerobot.REMARK]
-    return Survey(tuple(sound), columns, (*logs.remarks, *guessed), tuple(logs.passed))
+    remarks, timed = (*logs.remarks, *guessed), any(c.role == "time" for c in columns)
+    stated = {} if timed else intervals_stated(folder, {trial.file for trial in sound})
+    return Survey(tuple(sound), columns, remarks, tuple(logs.passed), stated)
 
 
 @dataclass
@@ -304,10 +310,10 @@ class _Logs:
         if not self.found:
             raise self.fault()
 
-    def _read_one(self, name: str, columns: Mapping[str, str], column: str) -> RawTrial:
-        datetimes = {column: ""} if columns[column] == "datetime" else {}
+    def _read_one(self, name: str, columns: Mapping[str, str], *wanted: str) -> RawTrial:
+        moments = {column: "" for column in wanted if columns[column] == "datetime"}
         return read_trial(
-            self.folder / name, [column], name=name, datetimes=datetimes, dialect=self.dialect
+            self.folder / name, wanted, name=name, datetimes=moments, dialect=self.dialect
         )
 
     def fault(self) -> InputError:
@@ -501,7 +507,8 @@ class _Logs:
             return [trial]
         times = [c for c, u in columns.items() if _role(c, u) == "time"]
         column = (times or sorted(columns, key=lambda name: "[:]." not in name))[0]
-        raw = self._read_one(trial.file, columns, column)
+        moving = [c for c, u in columns.items() if _role(c, u) == "position"] if times else []
+        raw = self._read_one(trial.file, columns, column, *moving)
         starts = starts_of(raw, column if times else "")
         if len(starts) == 1:
             return [trial]

@@ -15,6 +15,7 @@ COARSEST_STAMP = 0.05
 _PERIODS = (
     *((f"{n} bits", unit * 2.0**n) for n in (32, 24, 16) for unit in (1.0, 1e-3, 1e-6, 1e-9)),
     *(("midnight", unit * 86_400.0) for unit in (1.0, 1e3, 1e6, 1e9)),
+    *(("a full second", unit) for unit in (1.0, 1e3, 1e6, 1e9)),
 )
 """Where clocks roll over, and after how much, by what stamps may have been multiplied by."""
 _NEAR_ROLL = 5.0
@@ -39,12 +40,12 @@ _SMOOTHER = 0.8
 written late; above, the clock was set back."""
 _UNLIKELY_TWICE = 0.1
 """Share of stamps that stand twice once rows are sorted, from which two recordings are mixed."""
-_SEAM = 3.0
+SEAM = 3.0
 """Times the largest step of a position, over which it goes on where a clock was set back."""
 
 
 def unroll(t: Array) -> tuple[Array, str, NDArray[np.intp]]:
-    """Undo the roll-over of a counter of 16, 24 or 32 bits, or of a time of day.
+    """Undo the roll-over of a counter of 16, 24 or 32 bits, of a time of day or of a second.
 
     Args:
         t: (T,) stamps, in whatever unit.
@@ -257,7 +258,7 @@ def put_in_order(table: TrialTable) -> None:
             at, step = int(falls[0]), float(np.median(np.diff(t)))
             size = t[at] - t[at + 1] + step
             moved = np.abs(np.diff(positions))
-            goes_on = moved[:, at] <= _SEAM * np.delete(moved, at, axis=1).max(axis=1)
+            goes_on = moved[:, at] <= SEAM * np.delete(moved, at, axis=1).max(axis=1)
             # After a lone stamp that is wrong, the clock is where it was.
             if (stop - at) * step > 0.5 * size and goes_on.all():
                 t[at + 1 :] += size

@@ -96,13 +96,15 @@ def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:
     """Interpolate isolated wild readings; refuse a lasting jump (lost counts, a reset).
 
     A step is wild when it is 20 times what all but one step in twenty stay below, and faster
-    than any of these axes can go.
+    than any of these axes can go; where samples are missing, it is that of each of them.
     """
     values = table.columns[encoder.column]
     if len(table) <= 2 * table.limits.nan_run:
         return
-    steps = np.abs(np.diff(values))
-    fastest = FASTEST[encoder.unit] * float(np.median(np.diff(table.t))) / encoder.scale
+    usual = float(np.median(np.diff(table.t)))
+    spanned = np.maximum(np.diff(table.t) / usual, 1.0)
+    steps = np.abs(np.diff(values)) / spanned
+    fastest = FASTEST[encoder.unit] * usual / encoder.scale
     limit = max(20 * float(np.quantile(steps, 0.95)), abs(fastest))
     jumps = np.flatnonzero(steps > limit)
     if len(jumps) == 0:
@@ -111,7 +113,7 @@ def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:
     level = median_filter(values, 2 * run + 1, mode="nearest")
     level[:run], level[total - run :] = level[run], level[total - run - 1]
     wild = np.abs(values - level) > limit
-    lasting = np.flatnonzero(np.abs(np.diff(level)) > limit)
+    lasting = np.flatnonzero(np.abs(np.diff(level)) / spanned > limit)
     if len(lasting) or wild.sum() > table.limits.nan_share * total:
         at = int(lasting[0] if len(lasting) else jumps[0])
         size = abs(values[at + 1] - values[at]) * abs(encoder.scale)

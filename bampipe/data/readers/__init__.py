@@ -34,7 +34,7 @@ _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     ((".parquet",), parquet, "Parquet file", _AGAIN),
     ((".feather", ".arrow"), parquet, "Feather file", _AGAIN),
     ((".mat",), mat.READER, "MATLAB file", "save it again from MATLAB"),
-    ((".h5", ".hdf5", ".hdf", ".nc"), hdf5.READER, "HDF5 file", _AGAIN),
+    (hdf5.ENDINGS, hdf5.READER, "HDF5 file", _AGAIN),
     (_OBJECTS, objects.READER, "", ""),
     ((".tdms",), tdms.READER, "TDMS file", _AGAIN),
     ((".bag", ".db3"), bag, "bag", f"{_AGAIN}, with the message definitions in it"),
@@ -62,7 +62,7 @@ _KINDS = (
     (b"\x1f\x8b", (_UNPACK, ".gz"), "a gzip archive"),
     (b"version https://git-lfs", ("fetch the file: git lfs pull",), "a pointer of Git LFS"),
     (b"MATLAB", (".mat",), "a MATLAB file"),
-    (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".nc", ".mat"), "an HDF5 file"),
+    (hdf5.SIGNATURE, (*hdf5.ENDINGS, ".mat"), "an HDF5 file"),
 )
 
 

@@ -56,7 +56,7 @@ class Stored:
     unit: str = ""
 
 
-_NAMES = ("name", "label", "signalname", "signal", "channel")
+NAMES = ("name", "label", "signalname", "signal", "channel")
 _VALUES = ("values", "value", "data")
 """Fields that hold the name of a signal, and its samples."""
 Arrays = Mapping[str, Stored]
@@ -159,14 +159,15 @@ def _in_steps(arrays: Arrays) -> Arrays:
     That is their unit, and none that is known where it may have been applied already, as to numbers
     that are no integers, or may be of another array in its group.
     """
-    found = dict(arrays)
+    found, held = dict(arrays), [n for n, array in arrays.items() if array.kind != STATED]
     for label, number in arrays.items():
         said = _SCALE.search(label)
         if not said or number.kind not in _NUMBERS or math.prod(number.shape) > LARGEST_WIDTH:
             continue
         owner, sizes = re.escape(label[: said.start()]), sorted({*number.load().ravel().tolist()})
-        tied = [n for n in arrays if re.fullmatch(rf"(?i){owner}([./]({'|'.join(_VALUES)}))?", n)]
-        group = (n for n in arrays if re.match(f"{owner}[./]" if owner else "", n))
+        tied = [n for n in held if re.fullmatch(rf"(?i){owner}([./]({'|'.join(_VALUES)}))?", n)]
+        tied = tied or namesakes(label[: said.start()], held)
+        group = (n for n in held if re.match(f"{owner}[./]" if owner else "", n))
         for name in tied or (name for name in group if not _CLOCK.match(name)):
             known, values = found[name], np.empty(0)
             values = known.load() if known.kind in _NUMBERS else values
@@ -179,25 +180,35 @@ def _in_steps(arrays: Arrays) -> Arrays:
     return found
 
 
+def namesakes(owner: str, labels: Iterable[str]) -> list[str]:
+    """The label with the last name of an ``owner`` elsewhere: data.q of meta.q; [] of several."""
+    name = re.split(r"[./]", owner)[-1]
+    found = [label for label in labels if re.split(r"[./]", label)[-1] == name != ""]
+    return found if len(found) == 1 else []
+
+
 def called_signals(labels: Iterable[str], texts: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     """Names and units of arrays by their labels, out of the ``texts`` beside them.
 
     Structs of a list that say what they are called go by that name, and units beside an array are
     its own: so scopes and recorders write their channels.
     """
-    names, units = dict[str, str](), units_beside(texts)
+    names, units, labels = dict[str, str](), units_beside(texts), [*labels]
     for label, text in texts.items():
         owner, _, key = label.rpartition(".")
-        if key.lower() in _NAMES and owner.endswith("]"):
+        if key.lower() in NAMES and owner.endswith("]"):
             names.setdefault(owner, re.sub(r"[^\w ./+-]|[\[\]]", "", text))
     several = Counter((owner.rpartition("[")[0], name) for owner, name in names.items())
+    of_names = {names.get(owner, owner): unit for owner, unit in units.items()}
+    far = {own[0]: u for x, u in of_names.items() if (own := namesakes(x, labels))}
     found: dict[str, tuple[str, str]] = {}
     for label in labels:
         owner, _, key = label.rpartition(".")
         kept, sampled, name = owner.rpartition("[")[0], key.lower() in _VALUES, label
         if owner in names and several[kept, names[owner]] == 1:
             name = f"{kept}.{names[owner]}" + ("" if sampled else f".{key}")
-        found[label] = name, units.get(label) or (units.get(owner, "") if sampled else "")
+        beside = units.get(owner, "") if sampled else ""
+        found[label] = name, units.get(label) or beside or far.get(label, "")
     return found
 
 

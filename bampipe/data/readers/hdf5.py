@@ -19,6 +19,8 @@ from bampipe.data.units import SCALES, in_steps
 from bampipe.errors import InputError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
+ENDINGS = (".h5", ".hdf5", ".hdf", ".nc")
+"""File extensions."""
 _MOST_DATASETS = 2000
 _BLOCK_ROWS = 1 << 14
 _COLUMNS = ("columns", "channels", "names", "column_names", "labels", "fields")
@@ -41,6 +43,19 @@ def opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
 
 
 READER = ArrayReader("dataset", opened)
+
+
+def numbers_of(path: Path) -> dict[str, float]:
+    """Single numbers in the attributes of a file and of what is in it, by their names."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        found = dict(file.attrs)
+        file.visititems(
+            lambda label, item: found.update({f"{label}.{k}": v for k, v in item.attrs.items()})
+        )
+    kept = {k: np.asarray(value) for k, value in found.items()}
+    return {k: float(x.item()) for k, x in kept.items() if x.size == 1 and x.dtype.kind in "iuf"}
 
 
 def _arrays(file: Any, alone: bool) -> Iterator[tuple[str, Stored]]:

@@ -13,7 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import STATED, ArrayReader, Opened, Stored, called_signals, stored
+from bampipe.data.readers.arrays import (
+    NAMES,
+    STATED,
+    ArrayReader,
+    Opened,
+    Stored,
+    called_signals,
+    stored,
+)
 from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
 from bampipe.data.readers.trial import Wanted, opened
 from bampipe.data.units import units_beside
@@ -28,7 +36,8 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
     if isinstance(value, dict):
         for key, item in value.items():
             lists = [other for other in value.values() if isinstance(other, list)]
-            texts = [own for own in lists if all(isinstance(x, str) and x for x in own)]
+            called = [[_name_of(x) for x in own] for own in lists]
+            texts = [own for own in called if all(isinstance(x, str) and x for x in own)]
             names = [own for own in texts if len(set(own)) == len(own)]
             inner = f"{path}.{key}" if path else str(key)
             for label, array in _arrays(item, inner):
@@ -53,6 +62,12 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
             return
         if array.ndim <= 2 and array.size and len(array) > 1:
             yield path or "data", array
+
+
+def _name_of(item: object) -> object:
+    """What an object says that it is called; anything else itself."""
+    keys = (key for key in item if key.lower() in NAMES) if isinstance(item, dict) else ()
+    return next((item[key] for key in keys), item)
 
 
 def _with_lists(content: object, depth: int = 2) -> object:
@@ -94,10 +109,11 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         content = _with_lists(_parsed(text))
     items = content.items() if isinstance(content, dict) else [("", content)]
     lists = {str(k): v for k, v in items if isinstance(v, list) and v and isinstance(v[0], dict)}
-    # Objects are samples rather than recordings, whose values are lists longer than that of them.
+    # Objects are samples rather than recordings or channels: lists in or beside these are longer.
+    beside_it = content.values() if isinstance(content, dict) else ()
     single = all(
         any(reads_as_number(x) for _, x in leaves(v[0]))
-        and not any(isinstance(x, list) and len(x) > len(v) for x in v[0].values())
+        and not any(isinstance(x, list) and len(x) > len(v) for x in (*v[0].values(), *beside_it))
         for v in lists.values()
     )
     texts = {path: text for path, text in leaves(content) if isinstance(text, str)}

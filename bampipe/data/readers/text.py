@@ -73,6 +73,20 @@ def columns(path: Path, dialect: Dialect | None = None) -> dict[str, str]:
     }
 
 
+def above_samples(path: Path) -> str:
+    """What stands above the samples of a table.
+
+    Raises:
+        InputError: it is none.
+    """
+    with _opened(path, Dialect()) as (stream, dialect, _):
+        head = _head(stream)
+    if dialects.share_of_rows(head) < _LEAST_ROWS:
+        raise InputError("not a table")
+    start = dialects.find_layout(head, (), dialect).start
+    return head[:start].decode("utf-8", "replace")
+
+
 def is_table(path: Path) -> bool:
     """Whether a file of an unknown extension is text with rows of numbers."""
     try:

@@ -96,6 +96,8 @@ class Clock(Declaration):
     where left out"""
     nanoseconds: str = ""
     """A second column of nanoseconds on top of whole seconds, as in ROS stamps"""
+    fraction_unit: Literal["ns", "us", "ms"] = "ns"
+    """Of that column, if it counts otherwise"""
 
     @property
     def datetime(self) -> bool:
@@ -119,8 +121,8 @@ class Clock(Declaration):
                 'unit = "ticks" and ticks_per_s belong together',
                 remedy="ticks_per_s is what the counter counts in a second, by its data sheet",
             )
-        if self.nanoseconds and self.unit != "s":
-            yield InputError('only for unit = "s"', where="nanoseconds")
+        if self.nanoseconds and self.unit not in ("s", "datetime"):
+            yield InputError('only for unit = "s" or "datetime"', where="nanoseconds")
 
 
 class Velocity(Declaration):

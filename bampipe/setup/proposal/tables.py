@@ -9,6 +9,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.quality.clock import spread_stamps, unroll
 from bampipe.data.session import SECONDS, Register
+from bampipe.data.stated_rate import interval_of
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import bare, spelled, unit
 from bampipe.errors import InputError
@@ -25,8 +26,8 @@ _LIKELY_RATE_HZ = 100.0
 """Assumed for the other guesses where nothing shows the rate."""
 _COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timesteps", "cyccnt"])
 """Words in the name of a clock that counts at a rate of its own."""
-_SECONDS = {"sec", "secs", "seconds"}
-_NANOSECONDS = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
+_FRACTIONS = {"ns": 1e9, "us": 1e6, "ms": 1e3}
+"""Units of what stands on top of whole seconds, and how many make one."""
 _MIXED = 0.1
 """Share of steps at which times fall that are all different, of rows that stand out of order."""
 _SLOW_HZ = 40.0
@@ -65,13 +66,11 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     """Propose a clock: by stamps in one column or two, else by counting samples."""
     counters = [c for c in found.columns if not c.role and not _COUNTERS.isdisjoint(words(c.name))]
     unnamed = [c for c in found.columns if not c.role and c not in counters and _counts_on(c)]
-    times = [*found.of("time"), *counters, *unnamed]
-    whole = [(c, {*words(c.name)}) for c in times if c.is_integer]
-    seconds = [c for c, said in whole if said & _SECONDS and np.all(np.diff(c.values) >= 0)]
-    on_top = [c for c, said in whole if said & _NANOSECONDS]
-    rest = [c for c in on_top if np.all((c.values >= 0) & (c.values < 1e9))]
-    if seconds and rest:
-        return _in_two_columns(seconds[-1], rest[-1], notes)
+    whole = [c for c in found.of("time") if c.is_integer]
+    for rest in reversed(whole):
+        for seconds in reversed(whole):
+            if unit := _fraction_of(seconds, rest):
+                return _in_two_columns(seconds, rest, unit, notes)
     # When a message was recorded is the second best to when it was stamped.
     topics = {c.name.partition(":")[0] for c in found.of("position") if c.name[:1] == "/"}
 
@@ -125,28 +124,42 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     return ProposedClock(t, (column.name,), lines, _stamped_rate(t, notes))
 
 
-def _in_two_columns(seconds: SurveyedColumn, rest: SurveyedColumn, notes: Notes) -> ProposedClock:
-    """Whole seconds and the nanoseconds on top of them, as ROS has them."""
-    t = seconds.values - seconds.values[0] + 1e-9 * (rest.values - rest.values[0])
-    note = notes.guess(f"seconds in {seconds.name}, nanoseconds on top in {rest.name}")
-    on_top = f"nanoseconds = {quoted(rest.name)}{note}"
-    lines = (f"column = {quoted(seconds.name)}", 'unit = "s"', on_top)
+def _fraction_of(seconds: SurveyedColumn, rest: SurveyedColumn) -> str:
+    """Unit of a column that starts again where whole seconds go on; "" where it does not."""
+    most, ahead = float(np.max(rest.values)), np.diff(seconds.values)
+    # By its size, unless some milliseconds were lost or it is rounded to a few of them.
+    kind = next((u for u, size in _FRACTIONS.items() if 0.5 * size < most < size), "")
+    again = np.diff(rest.values) < 0.0
+    fits = kind and ahead.min() >= 0.0 and again.any() and rest.values.min() >= 0.0
+    return kind if fits and np.array_equal(again, ahead > 0.0) else ""
+
+
+def _in_two_columns(
+    seconds: SurveyedColumn, rest: SurveyedColumn, kind: str, notes: Notes
+) -> ProposedClock:
+    """Whole seconds and what stands on top of them, as ROS and C have them."""
+    t = seconds.values - seconds.values[0] + (rest.values - rest.values[0]) / _FRACTIONS[kind]
+    note = notes.guess(f"whole seconds in {seconds.name}, {kind} on top in {rest.name}")
+    whole = "datetime" if seconds.stated == "datetime" else "s"
+    lines = [f"column = {quoted(seconds.name)}", f'unit = "{whole}"']
+    lines += [f"nanoseconds = {quoted(rest.name)}{note}"]
+    lines += [f'fraction_unit = "{kind}"'] * (kind != "ns")
     return ProposedClock(t, (seconds.name, rest.name), lines, _stamped_rate(t, notes))
 
 
 def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
     """No column is a clock; a number beside the samples may give the rate."""
     samples = np.arange(len(found.columns[0].values))
-    steps = [
-        (guesses.interval_of(column.name, float(column.values[0])), column.name)
-        for column in found.columns
-        if column.is_constant
-    ]
-    step_s, name = max(steps, default=(0.0, ""))
-    if step_s > 0.0:
+    constants = {c.name: float(c.values[0]) for c in found.columns if c.is_constant}
+    steps = {name: interval_of(name, value) for name, value in constants.items()}
+    steps = {name: step for name, step in steps.items() if step > 0.0}
+    steps |= {name: step for name, step in found.intervals.items() if name not in steps}
+    rates = {name: float(f"{1.0 / step:.6g}") for name, step in steps.items()}
+    if len(set(rates.values())) == 1:
+        name, rate_hz = next(iter(rates.items()))
         note = notes.guess(f"samples are counted, and {name} sets the rate")
-        rate = f"sample_rate_hz = {1.0 / step_s:g}"
-        return ProposedClock(step_s * samples, (name,), (f'unit = "samples"{note}',), rate)
+        lines, taken = (f'unit = "samples"{note}',), tuple(n for n in rates if n in constants)
+        return ProposedClock(samples / rate_hz, taken, lines, f"sample_rate_hz = {rate_hz:g}")
     numbers = next((c for c in found.columns if not c.role and _numbers_rows(c)), None)
     if numbers is not None:
         note = notes.ask(
@@ -168,6 +181,8 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
                 remedy="sort its rows by their time",
             )
         why = f"{stamps.name} falls at {np.sum(steps < 0)} and stands at {np.sum(steps == 0)} steps"
+    if rates:
+        why += f", and the rates are {join_names(f'{rates[n]:g} Hz by {n}' for n in rates)}"
     note = notes.guess(f"samples are counted: {why}")
     rate = UNKNOWN_RATE + notes.ask("sample_rate_hz, rows a second", _OF_ROWS)
     return ProposedClock(samples / _LIKELY_RATE_HZ, (), (f'unit = "samples"{note}',), rate)

@@ -1,0 +1,86 @@
+"""The rate of samples where no column has their time: what a file, or one beside it, says of it."""
+
+import re
+from collections.abc import Collection, Iterator
+from itertools import chain
+from pathlib import Path
+
+from bampipe.data.guesses import RATES_HZ
+from bampipe.data.readers import extension_of, hdf5, is_text, text
+from bampipe.data.readers.trial import NUMBER
+from bampipe.data.units import unit
+
+_SMALL = 1 << 16
+"""Bytes of what is written about logs, the most."""
+_NOTES = (
+    ".json",
+    ".yaml",
+    ".yml",
+    ".toml",
+    ".ini",
+    ".cfg",
+    ".txt",
+    ".md",
+    ".hdr",
+    ".info",
+    ".meta",
+)
+"""File extensions of what is written about logs."""
+_STATEMENT = re.compile(
+    r"(?P<name>[A-Za-z][\w .-]*?)\s*(?:[\[(](?P<of>[^\])\d]*)[\])])?"
+    r"[\"']?\s*[=:;,\t ]{1,3}\s*[\"']?"
+    rf"(?P<value>{NUMBER})[ \t]*[\[(]?(?P<unit>[A-Za-z]+(?:/s)?)?"
+)
+_SAMPLES = r"(?:data|sampl\w*|abtast|scan|acquisition|logging|log|recording|frame)"
+_RATE = re.compile(rf"fs|fsample|{_SAMPLES}(?:rate|freq\w*)")
+_INTERVAL = re.compile(
+    rf"ts|dt|tsample|delta[tx]|interval|{_SAMPLES}(?:time|period|zeit|interval\w*)"
+)
+_PER_SECOND = ("S/s", "sps", "SPS")
+
+
+def interval_of(name: str, value: float, said: str = "") -> float:
+    """Sampling interval, s, that a number beside the samples gives (``Ts``, ``fs``), else 0.
+
+    ``said``: its unit, where that is no part of the name.
+    """
+    bare = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name.rpartition(".")[2])
+    words = re.split(r"[\W_]+", bare.strip())
+    if not said and len(words) > 1 and (words[-1] == "s" or unit(words[-1].replace("hz", "Hz"))):
+        said = words.pop().replace("hz", "Hz")
+    plain, known = "".join(words).lower(), unit(said) if said and said not in _PER_SECOND else None
+    rate = _RATE.fullmatch(plain) is not None
+    if value <= 0.0 or not (rate or _INTERVAL.fullmatch(plain)):
+        return 0.0
+    if known is not None and known.si != ("Hz" if rate else "s"):
+        return 0.0
+    size = value * (known.scale if known is not None else 1.0)
+    step = 1.0 / size if rate else size
+    return step if RATES_HZ[0] <= 1.0 / step <= RATES_HZ[1] else 0.0
+
+
+def intervals_stated(folder: Path, logs: Collection[str]) -> dict[str, float]:
+    """Sampling intervals, s, by file and name: of ``logs``, and of notes written beside them."""
+    notes = (path for path in sorted(folder.rglob("*")) if extension_of(path.name) in _NOTES)
+    beside = [p for p in notes if p.is_file() and p.stat().st_size < _SMALL]
+    found = {}
+    for path in [*(folder / name for name in sorted(logs)), *beside]:
+        file = path.relative_to(folder).as_posix()
+        for name, value, said in _numbers_of(path, file in logs):
+            step = interval_of(name, value, said)
+            found |= {f"{name} in {file}": step} if step else {}
+    return found
+
+
+def _numbers_of(path: Path, is_log: bool) -> Iterator[tuple[str, float, str]]:
+    """Names, values and units of the numbers that a log states above its samples, or a note."""
+    if extension_of(path.name) in hdf5.ENDINGS:
+        yield from ((name, value, "") for name, value in hdf5.numbers_of(path).items())
+        return
+    if not is_log:
+        said = path.read_text("utf-8", "replace")
+    else:
+        said = text.above_samples(path) if is_text(path.name) else ""
+    for match in chain.from_iterable(map(_STATEMENT.finditer, said.splitlines())):
+        unit_of = match["of"] or match["unit"] or ""
+        yield match["name"], float(match["value"]), unit_of
