@@ -159,7 +159,7 @@ class Form:
         times: time between samples, and duration of a trial, s.
         scale: highest speed or acceleration of the axis if that is the factor, else 1.
         other_quantities: further quantities, ``x2``, ``x3`` in the shape, and their ranges.
-        prefix: prefix of its name if a model has two terms of one form.
+        prefix: prefix of its name if the model has a form of that name already.
         takes_timing: always false, since no form delays a force.
     """
 

@@ -261,10 +261,11 @@ class _AxisSearch:
         """Fit the model with each of the best forms, all parameters together."""
         keys = search.best_forms(_REFINED, self.session.jobs)[:_FITTED]
         terms, tasks = [], []
+        taken = {declared["name"] for declared in current.spec.extra}
         for key in keys:
             form, solution = search.forms.candidates[key[0]], search.solve((key,))
-            if form.name in [one.name for one in current.terms]:
-                form = replace(form, prefix="other_")
+            while form.name in taken:
+                form = replace(form, prefix=f"other_{form.prefix}")
             wider = replace(
                 current.spec,
                 effects=(*current.spec.effects, form.canonical_name),
