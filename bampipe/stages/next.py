@@ -303,8 +303,11 @@ def _record(
         shows=find_shown(table),
     )
     unlimited = [axis for axis in case.system.coordinates if axis not in limits]
-    missing = case.diagnosed.selected if case.diagnosed is not None else None
-    judged = case.diagnosed or case.run.find(ValidateResult, case.config.model)
+    diagnosed, missing = case.diagnosed, None
+    if diagnosed is not None:
+        certain = [v.effects for v in diagnosed.axes.values() if v.verdict == "missing"]
+        missing = [e for e in diagnosed.selected if any(e in effects for effects in certain)]
+    judged = diagnosed or case.run.find(ValidateResult, case.config.model)
     axes = judged.axes.items() if judged is not None else ()
     lacking = [axis for axis, entry in axes if entry.standing == "above_floor"]
     why, expected = explain_proposal(result, unlimited, lacking, missing, unbraked)
