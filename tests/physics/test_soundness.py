@@ -25,9 +25,8 @@ def arm(rotor: float):
 def hold(system, q):
     """Hold a machine at poses (T, n_q) without any input."""
     flat, t = np.zeros_like(q), np.arange(len(q)) * 0.01
-    require_sound(
-        system, [Motion("t01", t, q, flat, flat, flat, dict.fromkeys(system.inputs, 0 * t))]
-    )
+    idle = dict.fromkeys(system.inputs, 0 * t)
+    require_sound(system, [Motion("t01", t, q, flat, flat, flat, idle)])
 
 
 def check(system, reach):
