@@ -240,7 +240,9 @@ class Effect(DeclaredFile):
         if self.scope == "force_component":
             return {n: (f,) for n, f in zip(device.components, device.forces, strict=True)}
         if self.scope == "force_pair":
-            return _pair_forces(device)
+            # The drives of a robot may share a gear with their neighbours, not with all others.
+            farthest, between = (1, "-") if device.robot else (len(device.forces), "")
+            return _pair_near(device.components, device.forces, farthest, between)
         return {"": ()} if self._fits_device(device) else {}
 
     def _pair_axes(self, device: Device) -> dict[str, tuple[str, str]]:
@@ -315,16 +317,6 @@ class Effect(DeclaredFile):
         known |= {*device.definitions, *device.constants, *device.channels, *self.parameters}
         known |= {*self.definitions} | {entry.name for entry in (*device.parameters, *self.states)}
         return keys <= places and self.names <= known | {*device.brakes.values()}
-
-
-def _pair_forces(device: Device) -> dict[str, tuple[str, str]]:
-    """Pairs of a force channel and one that may leak into it, by the text after the colon.
-
-    The drives of a robot may share a gear with their neighbours, not with all others.
-    """
-    names, forces = device.components, device.forces
-    farthest, between = (len(names), "") if device.robot is None else (1, "-")
-    return _pair_near(names, forces, farthest, between)
 
 
 def _pair_near(

@@ -48,9 +48,9 @@ class Equations:
         kinetic, potential: declared energies, definitions put in; without those of a robot's
             bodies.
         dependence: of the residual on each parameter.
-        compensation: per coordinate, the part of Q_other that balances gravity there: see
-            `roles.find_compensation`; zero without one.
-        delays: parameters that shift measured forces in time: see `roles.find_delays`.
+        compensation: per coordinate, the part of Q_other that balances gravity there;
+            zero without one.
+        delays: parameters that shift measured forces in time.
     """
 
     q: list[Any]

@@ -10,8 +10,8 @@ from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_spec
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.drafts import symbolic
-from bampipe.diagnosis.drafts.effect_file import declare
-from bampipe.diagnosis.drafts.search import FoundDraft, Term, draft_formulas
+from bampipe.diagnosis.drafts.search import FoundDraft, draft_formulas
+from bampipe.diagnosis.drafts.terms import Term
 from bampipe.diagnosis.session import Session
 from bampipe.errors import NothingToDoError
 from bampipe.files import toml_text, write_text
@@ -102,7 +102,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         if not named.effects or one.chosen.held_out_rmse < named.rmse_after:
             for term in one.terms:
                 file = f"models/{config.model}/drafts/{term.form.name}.toml"
-                write_text(out / file, toml_text(declare(term, source)))
+                write_text(out / file, toml_text(term.declaration(source)))
                 drafted[term.form.canonical_name] = _effect(term, file)
         rows = [row for row in diagnosis.ranking if row.axis == axis]
         entries[axis] = _axis(axis, one, drafted, named, rows)

@@ -51,13 +51,8 @@ from bampipe.schema import STRICT, Positive
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 from bampipe.trials.motion import trial_names
-from bampipe.trials.reading import (
-    read_band,
-    read_kinematics,
-    read_motions,
-    read_sensors,
-    require_sound_motions,
-)
+from bampipe.trials.reading import read_band, read_kinematics, read_motions, read_sensors
+from bampipe.trials.soundness import require_sound
 from bampipe.trials.timing import find_robot_timing
 
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
@@ -186,7 +181,7 @@ def _read(run: RunFolder, config: Config) -> _Task:
     model = load_model(run, config.model, as_declared=True)
     spec, system = read_spec(run, config.model, model), compile_model(model)
     motions = read_motions(run, system, fitted=True, braked=system.braked)
-    require_sound_motions(system, motions)
+    require_sound(system, motions)
     width = _choose_width(run, system, config)
     if width is not None:
         spec = spec.with_sign_widths(width.factor)

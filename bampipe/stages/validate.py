@@ -33,8 +33,9 @@ from bampipe.trials.kept import KeptItems
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
 from bampipe.trials.motion import trial_names, trial_sizes
 from bampipe.trials.noise_floor import NoiseFloor, count_floor_replicates, draw_trials
-from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
+from bampipe.trials.reading import held_out_trials, read_motions
 from bampipe.trials.residuals import rms
+from bampipe.trials.soundness import require_sound
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
@@ -74,7 +75,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     p = read_estimate(run, config.model, system)
     estimates = run.read(IdentifyResult, config.model)
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
-    require_sound_motions(system, trials.motions)
+    require_sound(system, trials.motions)
     progress(0.1, "residuals")
     # Parameters estimated with delayed inputs belong to inputs with that delay.
     published = np.append(p, estimates.input_timing.estimate - trials.late_s)

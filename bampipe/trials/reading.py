@@ -12,7 +12,6 @@ from bampipe.data.store import column_names, read_arrays, read_parquet, trial_id
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
-from bampipe.physics.soundness import require_sound
 from bampipe.results.filter import Disturbance, FilterResult
 from bampipe.results.ingest import IngestResult
 from bampipe.trials.kept import MOST_OF_TRIALS, KeptItems
@@ -152,19 +151,6 @@ def read_motions(
         for k in names
     )
     return KeptItems((motion.with_input_timing(late_s) for motion in read), MOST_OF_TRIALS)
-
-
-def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:
-    """Refuse trials on which the equations of motion cannot be solved.
-
-    Raises:
-        InputError: in a pose of a trial, the mass matrix is singular or a force is not finite.
-    """
-    for motion in motions:
-        require_sound(
-            system, *motion.kinematics, motion.inputs(system.inputs), system.prior,
-            motion.t, f"trial {motion.trial_id}",
-        )  # fmt: skip
 
 
 def read_samples(run: RunFolder, trial_id: str, system: System) -> dict[str, Array]:

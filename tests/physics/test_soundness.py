@@ -6,7 +6,8 @@ from motions import made_up_device, made_up_effect
 
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
-from bampipe.physics.soundness import require_sound
+from bampipe.trials.motion import Motion
+from bampipe.trials.soundness import require_sound
 
 
 def arm(rotor: float):
@@ -21,12 +22,15 @@ def arm(rotor: float):
     )
 
 
+def hold(system, q):
+    """Hold a machine at poses (T, n_q) without any input."""
+    flat, t = np.zeros_like(q), np.arange(len(q)) * 0.01
+    idle = dict.fromkeys(system.inputs, 0 * t)
+    require_sound(system, [Motion("t01", t, q, flat, flat, flat, idle)])
+
+
 def check(system, reach):
-    count = len(reach)
-    q = np.stack([np.full(count, 0.3), reach], axis=1)
-    flat = np.zeros((count, 2))
-    u = np.zeros((count, len(system.inputs)))
-    require_sound(system, q, flat, flat, u, system.prior, np.arange(count) * 0.01, "trial t01")
+    hold(system, np.stack([np.full(len(reach), 0.3), reach], axis=1))
 
 
 def test_no_inertia_at_the_pivot_without_a_rotor():
@@ -47,11 +51,7 @@ def test_no_inertia_at_the_pivot_without_a_rotor():
 def test_the_manipulator_has_inertia_everywhere(pose):
     """Its drives turn with it, so rho = 0 and a vertical rod are poses like any other."""
     system = compile_model(Model(registry.device("bam")))
-    flat = np.zeros((1, 3))
-    require_sound(
-        system, np.array([pose]), flat, flat, np.zeros((1, len(system.inputs))), system.prior,
-        np.zeros(1), "",
-    )  # fmt: skip
+    hold(system, np.array([pose]))
     rate = np.empty(6)
     x = np.array([*pose, 0.1, -0.1, 0.1])
     system.derivative(x, np.ones(len(system.inputs)), system.prior, np.zeros(4), rate)

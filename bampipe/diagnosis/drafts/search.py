@@ -19,6 +19,7 @@ from bampipe.diagnosis.dictionary import Dictionary, Key
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.forms import Form
+from bampipe.diagnosis.drafts.terms import Term
 from bampipe.diagnosis.probability import compute_p_value
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import TASKS_PER_PROCESS, Progress, make_columns, start_at
@@ -34,41 +35,6 @@ _TRIES = 90
 """Largest number of evaluations of a refinement."""
 _STEPS = {"place": 0.02, "length": 0.03, "time": 0.03, "wavenumber": 2e-4, "number": 0.003}
 """First step of the refinement of a shape, as a share of its range, by kind."""
-
-
-@dataclass(frozen=True)
-class Term:
-    """A form with the fitted values of its constants, by name, and their covariance."""
-
-    form: Form
-    values: dict[str, float]
-    covariance: Array
-
-    @property
-    def sd(self) -> dict[str, float]:
-        """Standard deviations of the constants, by name."""
-        spread = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        return dict(zip(self.values, map(float, spread), strict=True))
-
-    def curve(self, count: int = 121) -> tuple[Array, Array, Array]:
-        """Return quantity, torque and its standard deviation along the range, (count,) each.
-
-        The motion is in the positive direction, at the highest speed and acceleration and at the
-        upper end of all other quantities.
-        """
-        x = np.linspace(self.form.span.low, self.form.span.high, count)[:, None]
-        others = [np.full((count, 1), span.high) for _, span in self.form.other_quantities]
-        x = np.hstack([x, *others])
-        values = np.array(list(self.values.values()))
-        middle, steps = self._at(x, values), np.diag(1e-4 * np.maximum(np.abs(values), 1e-9))
-        slope = np.array([(self._at(x, values + s) - middle) / s.sum() for s in steps])
-        variance = np.einsum("kt,kl,lt->t", slope, self.covariance, slope)
-        return x[:, 0], middle, np.sqrt(np.maximum(variance, 0.0))
-
-    def _at(self, x: Array, values: Array) -> Array:
-        known = dict(zip(self.values, values, strict=True))
-        columns = self.form.shape.columns(x, self.form.constants_at(known, 0.0), is_quick=True)
-        return np.asarray(columns @ [known[n] for n in self.form.shape.strengths])
 
 
 @dataclass(frozen=True)
