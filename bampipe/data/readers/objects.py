@@ -36,8 +36,8 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
     if isinstance(value, dict):
         for key, item in value.items():
             lists = [other for other in value.values() if isinstance(other, list)]
-            called = [[_name_of(x) for x in own] for own in lists]
-            texts = [own for own in called if all(isinstance(x, str) and x for x in own)]
+            named = [[_name_of(x) for x in own] for own in lists]
+            texts = [own for own in named if all(isinstance(x, str) and x for x in own)]
             names = [own for own in texts if len(set(own)) == len(own)]
             inner = f"{path}.{key}" if path else str(key)
             for label, array in _arrays(item, inner):
@@ -66,8 +66,8 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
 
 def _name_of(item: object) -> object:
     """What an object says that it is called; anything else itself."""
-    keys = (key for key in item if key.lower() in NAMES) if isinstance(item, dict) else ()
-    return next((item[key] for key in keys), item)
+    own = item.items() if isinstance(item, dict) else ()
+    return next((text for key, text in own if key.lower() in NAMES), item)
 
 
 def _with_lists(content: object, depth: int = 2) -> object:
