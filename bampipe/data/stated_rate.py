@@ -63,7 +63,7 @@ def intervals_stated(folder: Path, logs: Collection[str]) -> dict[str, float]:
     """Sampling intervals, s, by file and name: of ``logs``, and of notes written beside them."""
     notes = (path for path in sorted(folder.rglob("*")) if extension_of(path.name) in _NOTES)
     beside = [p for p in notes if p.is_file() and p.stat().st_size < _SMALL]
-    found = {}
+    found = dict[str, float]()
     for path in [*(folder / name for name in sorted(logs)), *beside]:
         file = path.relative_to(folder).as_posix()
         for name, value, said in _numbers_of(path, file in logs):

@@ -98,6 +98,8 @@ _BY_UNIT = {
 _SHORT_UNITS = frozenset(["mm", "Nm", "kN", "gf", "mA", "mV"])
 _LONG_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano", "meter"])
 """Units of two letters at the end of a name that are no words, and longer ones that are."""
+_RATE = re.compile(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$")
+"""Unit of a velocity at the end of a name."""
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _PRESENT = frozenset(["current", "curr", "cur"])
 _LONGEST_WORD = 2
@@ -637,11 +639,16 @@ def _role(name: str, stated: str) -> str:
     first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]
     if first:
         return first[0]
-    if role := _role_by_unit(stated):
-        return role
     if said & _PLAIN_POSITIONS and said & _PRESENT:
         said -= _PRESENT  # the position that is current, and no current
     roles = [role for role, text in _WORDS.items() if said & set(text.split())]
+    role, own = _role_by_unit(stated), [r for r in roles if r in ("position", "force")]
+    if role == "voltage" and len(own) == 1:
+        return own[0]  # of a sensor, whose volts stand for what it measures
+    if role:
+        return role
+    if max(map(len, said), default=0) <= _LONGEST_WORD and (by_unit := _role_by_suffix(name)):
+        return by_unit  # t_Nm
     if len(roles) > 1 and (longer := {word for word in said if len(word) > 1}):
         roles = [r for r in roles if longer & set(_WORDS[r].split())] or roles  # T.Angle
     elif len(roles) > 1:
@@ -649,7 +656,7 @@ def _role(name: str, stated: str) -> str:
         return next((_role_by_unit(x) for x in re.split(r"\W|_", name)[1:] if x in ("A", "V")), "")
     if not roles and name.startswith(lerobot.STATE):
         return "voltage" if "load" in name else "position"
-    return next(iter(roles), "") or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
+    return next(iter(roles), "") or _role_by_suffix(name)
 
 
 def _role_by_unit(text: str) -> str:
@@ -657,8 +664,11 @@ def _role_by_unit(text: str) -> str:
     return _BY_UNIT.get(known.si, "") if known is not None else ""
 
 
-def _role_by_suffix(suffix: str) -> str:
+def _role_by_suffix(name: str) -> str:
     """The role by a unit at the end of a name that says nothing else."""
+    if _RATE.search(name):
+        return "velocity"
+    suffix = re.split(r"[_\W]+", name)[-1]
     long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _LONG_WORDS
     role = _role_by_unit(suffix) if long or suffix in _SHORT_UNITS else ""
     return role if role != "time" else ""
@@ -669,7 +679,7 @@ def _unit(name: str, stated: str, role: str) -> str:
     if stated:
         return "rev/s" if role == "velocity" and unit(stated) == unit("Hz") else stated
     bare = re.sub(r"(\[\d+\]|_\d+)$", "", _FACTOR.sub("", name.translate(_PLAIN)))
-    if role == "velocity" and (rate := re.search(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$", bare)):
+    if role == "velocity" and (rate := _RATE.search(bare)):
         return f"{rate[1]}/s"
     parts = re.findall(r"(?:\d+\.(?=\d))?[^\W_]+|[°%]", bare)
     both = ".".join(parts[-2:]) if role == "force" and len(parts) > 2 else ""  # in_lbs, not in_N

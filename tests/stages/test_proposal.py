@@ -588,8 +588,8 @@ def test_the_gear_of_a_motor_is_what_the_weight_says_and_missed_in_its_torque(tm
     session, proposal = proposed_for(
         pendulum("t,motor_deg,motor_torque_mNm", 4000.0, 14.0), tmp_path / "b"
     )
-    assert any("motor_torque_mNm is the torque of a motor" in line for line in proposal.check)
-    assert session["force"]["unit"] == "mN.m"
+    assert any('"motor_torque_mNm", the torque of a motor' in line for line in proposal.fill_in)
+    assert session["force"]["unit"] == "?"
 
 
 def test_of_joints_in_a_message_the_one_that_moves_is_the_axis(tmp_path):

@@ -28,6 +28,8 @@ def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
         found, expected = unit(text), unit(declared.get(column, ""))
         if found is None or expected is None or "" in (found.si, expected.si):
             continue
+        if found.si == "V" and declared[column][:1].isdigit():
+            continue  # what a volt of a sensor is worth
         if found.si == "kg":  # the weight of a mass
             found = unit(f"{text.strip('[]() ')}f") or found
         if found == unit("Hz") and expected.si == "rad/s":  # turns a second

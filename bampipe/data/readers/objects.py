@@ -12,16 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from bampipe.data.readers import arrays as known_arrays
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import (
-    NAMES,
-    STATED,
-    ArrayReader,
-    Opened,
-    Stored,
-    called_signals,
-    stored,
-)
+from bampipe.data.readers.arrays import ArrayReader, Opened, Stored, called_signals, stored
 from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
 from bampipe.data.readers.trial import Wanted, opened
 from bampipe.data.units import units_beside
@@ -36,8 +29,8 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
     if isinstance(value, dict):
         for key, item in value.items():
             lists = [other for other in value.values() if isinstance(other, list)]
-            called = [[_name_of(x) for x in own] for own in lists]
-            texts = [own for own in called if all(isinstance(x, str) and x for x in own)]
+            named = [[_name_of(x) for x in own] for own in lists]
+            texts = [own for own in named if all(isinstance(x, str) and x for x in own)]
             names = [own for own in texts if len(set(own)) == len(own)]
             inner = f"{path}.{key}" if path else str(key)
             for label, array in _arrays(item, inner):
@@ -66,8 +59,8 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
 
 def _name_of(item: object) -> object:
     """What an object says that it is called; anything else itself."""
-    keys = (key for key in item if key.lower() in NAMES) if isinstance(item, dict) else ()
-    return next((item[key] for key in keys), item)
+    own = item.items() if isinstance(item, dict) else ()
+    return next((text for key, text in own if key.lower() in known_arrays.NAMES), item)
 
 
 def _with_lists(content: object, depth: int = 2) -> object:
@@ -155,7 +148,10 @@ READER = ArrayReader("value", _opened)
 
 def _stating(found: Mapping[str, Stored], units: Mapping[str, str]) -> dict[str, Stored]:
     """What was found and the units of other quantities, such as ``"force units": "kip"``."""
-    return {**found, **{x: stored(None, u, STATED) for x, u in units.items() if x not in found}}
+    return {
+        **found,
+        **{x: stored(None, u, known_arrays.STATED) for x, u in units.items() if x not in found},
+    }
 
 
 def _column(samples: Sequence[object], name: str, units: Mapping[str, str]) -> Stored:

@@ -91,7 +91,8 @@ def propose(
     if chosen is None:
         chosen = devices.new_device(folder, match)
     elif (robot := chosen.device.robot) is not None:
-        columns = find_robot_columns(folder, chosen.device, robot, found, clock.t, notes)
+        timed = UNKNOWN not in clock.rate
+        columns = find_robot_columns(folder, chosen.device, robot, found, clock.t, timed, notes)
         match.robot, match.given = columns, columns.columns
         chosen = _with_guessed_motors(folder, chosen, match)
         if columns.mounting is not None and columns.mounting.hangs:

@@ -234,11 +234,9 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
     axis, placeholders = device.coordinates[0].name, list(device.constants)
     known = {axis: read, "supply": supply, device.forces[0]: driver}
     match.given = {name: column for name, column in known.items() if column is not None}
-    if match.turning and role == "force" and driver is not None and "motor" in words(driver.name):
-        notes.check.append(
-            f"{driver.name} is the torque of a motor, by its name: for that of the joint put the"
-            ' gear before the unit, as in unit = "70mN.m"'
-        )
+    on_motor = positions.is_of_motor(position) and not match.turning and not match.geared
+    if role == "force" and driver is not None and not linear and "motor" in words(driver.name):
+        match.of_motor = "" if on_motor else driver.name
     kind = "linear" if linear else "rotary"
     doubt = "" if position.si is not None else _MAY_SLIDE
     if doubt and linear:
@@ -300,8 +298,8 @@ def _at_joint(
         units = (position.unit,) if far else ("rad", "deg", "rev")
         named = [replace(position, unit=name) for name in units]
         fitting = [p for p in named if abs(p.scale * worth.size - 1.0) < _NEAR]
-        if fitting or not far:
-            return ((fitting or [position])[0],) * 2
+        if fitting:
+            return (fitting[0],) * 2
     match.turning = {position.name: worth}
     angle = (position.values - worth.zero) / worth.size
     return position, replace(position, values=angle, stated="rad", unit="rad")

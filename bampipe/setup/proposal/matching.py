@@ -35,6 +35,7 @@ class Matcher:
         turning: what the readings of a position are worth, by the weight on it, by name of column.
         given: columns that are known, by name of axis or input.
         reacting: the column of a drive that has the sign of the reaction, "" where none has.
+        of_motor: the column of a motor's torque beside the position of its joint, by name.
         geared: the position that may be a motor's before a gear of which nothing tells, by name.
         rivals: names of columns that may be the position, where there are several.
         scale_sd: field of the uncertainty of a scale that is guessed, by name of axis or input.
@@ -50,6 +51,7 @@ class Matcher:
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
     given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
     reacting: str = ""
+    of_motor: str = ""
     geared: str = ""
     rivals: list[str] = field(default_factory=list)
     scale_sd: dict[str, str] = field(default_factory=dict)

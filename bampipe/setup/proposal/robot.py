@@ -210,10 +210,11 @@ class RobotColumns:
 
 
 def find_robot_columns(
-    folder: Path, device: Device, robot: Robot, found: Survey, t: Array, notes: Notes
+    folder: Path, device: Device, robot: Robot, found: Survey, t: Array, timed: bool, notes: Notes
 ) -> RobotColumns:
     """Pair columns with joints and drives at ``t``, (T,) s, and hold them against the drawing.
 
+    That needs a rate that is known: unless ``timed``, it is assumed.
     What is guessed is noted, and how sure it is.
     """
     by_position, by_drive, some_drives = pair_joints(device, found)
@@ -229,7 +230,7 @@ def find_robot_columns(
         pairs = (zip(names, group.columns, strict=True) for names, group in groups if group)
         return dict(chain.from_iterable(pairs))
 
-    if positions is None or drives is None or any(map(in_counts, positions.columns)):
+    if positions is None or drives is None or any(map(in_counts, positions.columns)) or not timed:
         return RobotColumns(joints, pair(positions, drives) | some_drives)
     best = logged.explain(positions, drives, turns) if turns is not None else None
     if turns is None or best is None:

@@ -158,8 +158,9 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
     if len(set(rates.values())) == 1:
         name, rate_hz = next(iter(rates.items()))
         note = notes.guess(f"samples are counted, and {name} sets the rate")
-        lines, taken = (f'unit = "samples"{note}',), tuple(n for n in rates if n in constants)
-        return ProposedClock(samples / rate_hz, taken, lines, f"sample_rate_hz = {rate_hz:g}")
+        taken = tuple(n for n in rates if n in constants)
+        counted = (f'unit = "samples"{note}',)
+        return ProposedClock(samples / rate_hz, taken, counted, f"sample_rate_hz = {rate_hz:g}")
     numbers = next((c for c in found.columns if not c.role and _numbers_rows(c)), None)
     if numbers is not None:
         note = notes.ask(
@@ -272,6 +273,19 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
         said = f"stated as '{column.stated}'" if column.is_foreign else looks
         note = match.notes.ask("the unit of {}", UNITS, f"{column.name}, {said}")
         return entry(column.name, UNKNOWN, _velocity_beside(axis, match)) + note
+    if column.si == "V":
+        return entry(column.name, UNKNOWN) + match.notes.ask(
+            "the unit of {}, what one volt of it is, such as 47.7deg",
+            "the sensor's certificate, or what it reads in two places that are known",
+            column.name,
+        )
+    if not right and worth is not None:
+        return entry(column.name, UNKNOWN) + match.notes.ask(
+            f"the unit of {column.name}, which nothing states: by its weight, {axis.name} turns by"
+            f" 1 rad for {worth.size:.4g} ± {_rounded(worth.sd)} of it; behind a gear, as of"
+            f" {2.0 * np.pi * worth.size:.3g} turns, give unit and gear_ratio",
+            f"{UNITS}; rev is too",
+        )
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
     said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
     fields, how = _counting(axis, said, match, match.robot.gears.get(axis.name, 1.0))
@@ -378,7 +392,8 @@ def input_tables(device: Device, axes: Mapping[str, SurveyedColumn], match: Matc
         ask = "" if forces else notes.ask_column(missing, device.force_unit, UNDRIVEN)
         unit_of = [f'unit = "{device.force_unit}"']
         if forces:
-            unit_of = _force_unit(device, forces, given[device.forces[0]][1], match.notes)
+            why = given[device.forces[0]][1]
+            unit_of = _force_unit(device, forces, why, match.of_motor, match.notes)
         lines += [
             "[force]",
             f"columns = [{', '.join(map(quoted, names))}]{ask}",
@@ -393,8 +408,13 @@ def input_tables(device: Device, axes: Mapping[str, SurveyedColumn], match: Matc
     return lines + _channels_table(wanted, given, match)
 
 
-def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: Notes) -> list[str]:
-    """The unit that all force columns share, and what makes forces of volts or of counts."""
+def _force_unit(
+    device: Device, columns: list[SurveyedColumn], why: str, of_motor: str, notes: Notes
+) -> list[str]:
+    """The unit that all force columns share, and what makes forces of volts or of counts.
+
+    ``of_motor``: the column of the torque of a motor whose joint is what was logged, by name.
+    """
     units = {spelled(bare(column.unit), _FORCE_UNITS) for column in columns}
     common = units.pop() if len(units) == 1 else ""
     known = unit(common)
@@ -403,6 +423,12 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
     def ask_unit(question: str, where: str) -> list[str]:
         return [f'unit = "{UNKNOWN}"{notes.ask(question, where)}']
 
+    if columns[0].name == of_motor:
+        return ask_unit(
+            f"the unit of {names}, the torque of a motor by its name, at the joint: with the gear"
+            " before it, as 70N.m for 70 turns, or N.m without a gear",
+            "the gear's data sheet",
+        )
     if known is not None and known.si == device.force_unit and common:
         stated = all(column.stated for column in columns)
         guess = f"{names} is a {_QUANTITY[known.si]} in {common}"
@@ -512,6 +538,11 @@ def _channel(name: str, si: str, column: SurveyedColumn, why: str, match: Matche
     if register and si and not column.unit:
         return entry(column.name, UNKNOWN, fields) + notes.ask(
             f"the unit of {column.name}, what one count is, such as 2.69mA; {register.words}",
+            "the drive's table of registers",
+        )
+    if si == "A" and column.is_integer and not column.unit:
+        return entry(column.name, UNKNOWN, fields) + notes.ask(
+            f"the unit of {column.name}, whose whole numbers are mA or counts, such as 2.69mA",
             "the drive's table of registers",
         )
     if column.conversion is not None and column.si != si:
