@@ -7,11 +7,9 @@ bootstrap: Yao, Vehtari, Simpson and Gelman 2018, Bayesian Analysis 13, 917).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import logit, ndtr, softmax
-from scipy.stats import gumbel_r
 
 from bampipe.arrays import Array, Flags
 from bampipe.diagnosis.criteria import Criteria
@@ -291,8 +289,10 @@ def find_required_gain(criteria: Criteria, replicate_gains: Sequence[float] = ()
         return odds
     if p < LEAST_P_VALUE:
         return float("inf")
+    middle, scale = _law_of_largest(replicate_gains)
+    by_law = middle + scale * (np.log(np.log(2.0)) - np.log(-np.log1p(-p)))
     by_count = np.sort(replicate_gains)[-1 - int(p * len(replicate_gains))]
-    return max(odds, float(_law_of_largest(replicate_gains).isf(p)), float(by_count))
+    return max(odds, float(by_law), float(by_count))
 
 
 def compute_p_value(gain: float, replicate_gains: Sequence[float]) -> float:
@@ -301,13 +301,15 @@ def compute_p_value(gain: float, replicate_gains: Sequence[float]) -> float:
     It follows from the Gumbel distribution with the median and quartiles of the largest gains on
     replicates, and is at least the share of replicates with as large a gain.
     """
-    by_law = float(_law_of_largest(replicate_gains).sf(gain))
+    middle, scale = _law_of_largest(replicate_gains)
+    beyond = (gain - middle) / scale - np.log(np.log(2.0))
+    by_law = float(-np.expm1(-np.exp(-max(beyond, -50.0))))
     return max(by_law, float(np.mean(np.asarray(replicate_gains) >= gain)), LEAST_P_VALUE)
 
 
-def _law_of_largest(values: Sequence[float]) -> Any:
-    """Return the Gumbel distribution of largest gains, from their median and quartiles."""
+def _law_of_largest(values: Sequence[float]) -> tuple[float, float]:
+    """Return the median and the scale of the Gumbel distribution of largest gains."""
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
     # The log evidence of a single candidate scatters by half a nat per strength.
-    scale = max(float(high - low) / float(np.diff(gumbel_r.ppf([0.25, 0.75]))[0]), 1.0)
-    return gumbel_r(middle - scale * gumbel_r.median(), scale)
+    scale = max(float(high - low) / (np.log(np.log(4.0)) - np.log(np.log(4.0 / 3.0))), 1.0)
+    return float(middle), scale
