@@ -138,12 +138,16 @@ class Toy:
 def contents(root: Path) -> dict[str, bytes]:
     """The files of a run by path: results, without run.json and the private folder."""
     return {
-        path.relative_to(root).as_posix(): path.read_bytes()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-        and path.name != "run.json"
-        and path.relative_to(root).parts[0] != ".bampipe"
+        name: content
+        for name, content in bytes_of(root).items()
+        if not name.endswith("run.json") and not name.startswith(".bampipe/")
     }
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    """All files below a folder by path."""
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
 def misfits(root: Path) -> list[str]:

@@ -1,6 +1,7 @@
 """Runs on sessions of the independent simulators, short enough for tests."""
 
 import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from independent.sensors import Conditions
 import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.diagnosis.session import system_of
+from bampipe.files import toml_text
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.model_spec import ModelSpec
@@ -30,16 +32,20 @@ SHORT = {
     "wrist": Conditions(trials=3, seconds=4.0),
 }
 BUILT_IN = {"bam": "bam", "axis": "slider", "damper": "magnetic_damper"}
-PIPELINE = """schema = "bampipe.pipeline/1"
-name = "short"
-stages = ["ingest", "filter", "identify", "validate"]
-"""
+STAGES = ("ingest", "filter", "identify", "validate")
 
 
-def run_short(folder: Path, root: Path, pipeline: str = PIPELINE) -> bampipe.Run:
-    """Run the session in ``folder``, its logs as Parquet, through a pipeline of a few stages."""
+def run_short(
+    folder: Path, root: Path, stages: Sequence[str] = STAGES, **settings: Mapping[str, object]
+) -> bampipe.Run:
+    """Run the session in ``folder``, its logs as Parquet, through a few stages.
+
+    Args:
+        folder: of the session; root: has the run folders; stages: in order; settings: by stage.
+    """
     path = root / "short.toml"
-    path.write_text(pipeline)
+    content = {"schema": "bampipe.pipeline/1", "name": "short", "stages": list(stages)}
+    path.write_text(toml_text({**content, "settings": settings}))
     return bampipe.run_session(to_parquet(folder), runs=root / "runs", pipeline=str(path))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import install_toys
 import pytest
-from conftest import Command, Toy
+from conftest import Command, Toy, bytes_of
 from made_results import filled, write_result
 
 import bampipe
@@ -170,11 +170,11 @@ def test_a_typo_in_a_setting_changes_nothing(
     toy: Toy, command: Command, setting: str, said: str
 ) -> None:
     assert command("run", *arguments(toy))[0] == 0
-    before = {p: p.read_bytes() for p in toy.root.rglob("*") if p.is_file()}
+    before = bytes_of(toy.root)
     toy.ran()
     code, _, err = command("run", *arguments(toy), "--set", "toy_read.offset=1", "--set", setting)
     assert code == 2 and said in err and toy.ran() == []
-    assert {p: p.read_bytes() for p in toy.root.rglob("*") if p.is_file()} == before
+    assert bytes_of(toy.root) == before
     assert command("status", toy.root)[1].count("current") == 4
 
 

@@ -6,6 +6,7 @@ import independent
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import bytes_of
 from independent import arm
 from independent.sensors import HARD, Conditions
 from independent_runs import device_of
@@ -14,10 +15,6 @@ from scipy.interpolate import CubicSpline
 from bampipe.physics import Model
 
 BRIEF = Conditions(trials=1, seconds=0.8)
-
-
-def content(folder):
-    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 @pytest.mark.parametrize(
@@ -34,7 +31,7 @@ def test_every_effect_changes_what_is_recorded(tmp_path, machine):
     bare = {}
     for name, day in (("free", free), ("braked", braked)):
         independent.record(machine, tmp_path / name, 3, conditions=day)
-        bare[name] = content(tmp_path / name)
+        bare[name] = bytes_of(tmp_path / name)
     for number, effect in enumerate(
         (*known.EFFECTS, *known.UNKNOWN, *getattr(known, "BY_NAME", ()))
     ):
@@ -43,7 +40,7 @@ def test_every_effect_changes_what_is_recorded(tmp_path, machine):
         independent.record(machine, folder, 3, {effect: 1.0}, day)
         tables = [pd.read_csv(file) for file in sorted(folder.rglob("*.csv"))]
         assert all(np.isfinite(table.to_numpy()).all() for table in tables), effect
-        assert content(folder) != bare[name], effect
+        assert bytes_of(folder) != bare[name], effect
 
 
 @pytest.mark.parametrize("machine", independent.MACHINES)
@@ -60,7 +57,7 @@ def test_a_seed_gives_the_same_bytes_and_another_seed_others(tmp_path, machine):
     folders = [tmp_path / name / "session" for name in ("one", "two", "other")]
     for folder, seed in zip(folders, (5, 5, 6), strict=True):
         independent.record(machine, folder, seed, conditions=BRIEF)
-    one, two, other = map(content, folders)
+    one, two, other = map(bytes_of, folders)
     assert one == two
     assert one != other
     truths = [folder.with_name("session.truth.json").read_bytes() for folder in folders]
@@ -73,7 +70,7 @@ def test_conditions_change_the_recording_and_not_the_machine(tmp_path, day):
     truth = independent.record("joint", tmp_path / "bare", 7, {}, Conditions(**brief))
     short = {"trials": 2} if day == "three short trials" else brief
     hard = independent.record("joint", tmp_path / "hard", 7, {}, replace(HARD[day], **short))
-    assert content(tmp_path / "bare") != content(tmp_path / "hard")
+    assert bytes_of(tmp_path / "bare") != bytes_of(tmp_path / "hard")
     assert truth["parameters"] == hard["parameters"]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from independent import joint
 from independent.sensors import Conditions
-from independent_runs import run_short
+from independent_runs import STAGES, run_short
 from made_results import diagnosis, write_result
 from scipy.stats import norm
 
@@ -20,12 +20,6 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.pair import PairResult
 
 THICKER = 1.4
-PIPELINE = """schema = "bampipe.pipeline/1"
-name = "short"
-stages = ["ingest", "filter", "identify", "validate", "compare"]
-[settings.validate]
-free_run = false
-"""
 RECORDED = Conditions(creep=True, trials=8, seconds=8.0)
 
 
@@ -52,7 +46,9 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         head, *trials = path.read_text().split("[[trials]]")
         kept = trials[:4] if name == "first" else trials[4:]
         path.write_text("[[trials]]".join([head, *kept]))
-        found[name] = run_short(root / name, root, PIPELINE).root
+        found[name] = run_short(
+            root / name, root, (*STAGES, "compare"), validate={"free_run": False}
+        ).root
     return found
 
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from independent import prescribed
 from independent.sensors import Conditions
-from independent_runs import PIPELINE, record_trials
+from independent_runs import record_trials, run_short
 from sessions import fit_from_priors
 
-import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import change_set, gains_when_fitted, open_search
@@ -36,9 +35,7 @@ def test_delays_shorter_than_the_true_one_promise_what_they_can_at_their_bounds(
     """Without that, the only shape within its bounds was never weighed beside two that were not."""
     conditions = Conditions(trials=2, seconds=8.0, rate_hz=500.0)
     prescribed.record(tmp_path / "logs", 7, {"actuator_delay": 2.0}, conditions)
-    (tmp_path / "short.toml").write_text(PIPELINE)
-    pipeline = str(tmp_path / "short.toml")
-    run = bampipe.run_session(tmp_path / "logs", runs=tmp_path, pipeline=pipeline, last="filter")
+    run = run_short(tmp_path / "logs", tmp_path, ("ingest", "filter"))
     spec = ModelSpec(device_from(tomllib.loads(prescribed.DEVICE)).declaration, (), ())
     trials = read_measured_trials(RunFolder(run.root), system_of(spec), every_input=True)
     session = Session(trials, Criteria())

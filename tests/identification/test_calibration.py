@@ -6,17 +6,12 @@ import independent
 import numpy as np
 import pytest
 from independent.sensors import Conditions
-from independent_runs import run_short
+from independent_runs import STAGES, run_short
 from mistakes import scale_column, set_text
 
 from bampipe.results.identify import IdentifyResult, ParameterEstimate
 from bampipe.results.stiffness import StiffnessResult
 
-PIPELINE = """schema = "bampipe.pipeline/1"
-name = "short"
-stages = ["ingest", "filter", "identify"]
-settings = { identify = { method = "least-squares" } }
-"""
 SHARE = 0.02
 
 
@@ -26,7 +21,7 @@ def parameters_of(root: Path, *changes) -> dict[str, ParameterEstimate]:
     independent.record("joint", folder, 41, {}, Conditions(creep=True, trials=3, seconds=8.0))
     for change in changes:
         change(folder)
-    run = run_short(folder, root, PIPELINE)
+    run = run_short(folder, root, STAGES[:-1], identify={"method": "least-squares"})
     return dict(IdentifyResult.read(run.root / "models/base/identify.json").parameters)
 
 
@@ -90,8 +85,7 @@ def test_a_stiffness_is_as_uncertain_as_its_force(tmp_path) -> None:
     conditions = Conditions(trials=1, seconds=3.0, locked_trials=True)
     independent.record("bam", tmp_path / "bam", 41, {}, conditions)
     set_text("noise_sd_n", "gain_sd = 0.01\nnoise_sd_n")(tmp_path / "bam")
-    pipeline = PIPELINE.replace('"filter", "identify"', '"filter", "stiffness"')
-    run = run_short(tmp_path / "bam", tmp_path, pipeline.replace("settings", "#"))
+    run = run_short(tmp_path / "bam", tmp_path, ("ingest", "filter", "stiffness"))
     axes = StiffnessResult.read(run.root / "stiffness/stiffness.json").axes
     for entry in axes.values():
         assert entry.calibration_sd == pytest.approx(0.01 * entry.stiffness, rel=0.02)

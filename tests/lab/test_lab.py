@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import Command, misfits
+from conftest import Command, bytes_of, misfits
 from made_results import diagnosis, write_result
 from made_runs import Made
 
@@ -177,16 +177,12 @@ def test_the_same_runs_give_the_same_bytes_and_a_lost_device_goes(tmp_path: Path
     runs = make_lab(tmp_path, sessions=3)
     made(10, {"mass": 1.0}, device="rail/2").write(runs)
     lab = tmp_path / "lab"
-
-    def contents() -> dict[str, bytes]:
-        return {str(p.relative_to(lab)): p.read_bytes() for p in lab.rglob("*") if p.is_file()}
-
     collect(runs, lab)
-    first = contents()
+    first = bytes_of(lab)
     assert "parameters/device=rail%2F2/data.parquet" in first
     assert set(pd.read_parquet(lab / "sessions")["device"]) == {"bam", "rail/2"}
     collect(runs, lab)
-    assert contents() == first
+    assert bytes_of(lab) == first
     (runs / "s10" / "run.json").unlink()
     collect(runs, lab)
     assert not list(lab.glob("*/device=rail*"))

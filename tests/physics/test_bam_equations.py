@@ -174,22 +174,6 @@ def test_friction_and_brakes_take_energy_out_at_every_speed(system):
     np.testing.assert_array_equal(still, system.required(q, 0 * q, 0 * q, z, 0 * u, frictionless))
 
 
-def test_a_brake_holds_an_axis_that_is_pushed_less_than_its_command(system):
-    """Eq 18 below saturation: the axis creeps slower than the width of the smoothed sign."""
-    x = np.array([0.1, 0.05, 1.0, 0.0, 0.0, 0.0])
-    force = np.array([20.0, 0.0, 0.0])
-    u = np.array([*force, 60.0, 60.0, 200.0])
-    p, w, rate = system.prior, np.zeros(4), np.empty(6)
-    step = 2e-6
-    for _ in range(20000):
-        system.derivative(x, u, p, w, rate)
-        x += step * rate
-    torque = 20.0 * np.cos(0.05)
-    creep = BAM.coordinate("yaw").sign_width * np.arctanh(torque / (60.0 + 1.5))
-    assert x[3] == pytest.approx(creep, rel=1e-2)
-    assert abs(rate[3]) < 1e-3
-
-
 def test_singular_mass_matrix_gives_a_value_that_is_not_finite_instead_of_a_wrong_one():
     telescope = made_up_device(
         "mass*(length**2*ddt(angle)**2 + ddt(length)**2)/2",

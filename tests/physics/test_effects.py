@@ -129,18 +129,6 @@ def test_dissipative_as_claimed(case):
         assert (contribution(case, draw) * qd).max() < 1e-9
 
 
-def test_an_active_effect_would_be_caught():
-    active = registry.effect_from(
-        {**registry.effect("stribeck").declaration, "name": "push", "torque": "force*sgn(qd)"}
-    )
-    system = compile_model(Model(BAM, ["push:yaw"], [active]))
-    motion = smooth_motion(system)
-    added = residual(system, typical(system), motion) - residual(
-        system, typical(system, 0.0), motion
-    )
-    assert (added * motion[1]).max() > 0.1
-
-
 @pytest.mark.parametrize("case", TRIED)
 def test_absent_at_zero_strength_and_there_at_typical(case):
     there = np.abs(contribution(case, typical)).max()

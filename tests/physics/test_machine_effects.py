@@ -316,23 +316,6 @@ def test_a_hysteresis_over_next_to_nothing_stays_within_its_bounds(distance, sym
     np.testing.assert_allclose(z[settled], np.sign(v[settled, 0]), atol=tolerance)
 
 
-def test_a_hysteresis_too_stiff_for_runge_kutta_is_given_up_early():
-    """What decides for exponential steps is known at the first sample that moves."""
-    system = compile_model(Model(registry.device("magnetic_damper"), ["hysteresis:piston"]))
-    p = with_values(system, {"hysteresis.piston.distance": 1e-6})
-    t = np.arange(0.0, 0.1, 1e-3)
-    q, qd = 0.3 * t[:, None], np.full((len(t), 1), 0.3)
-    u = np.zeros((len(t), len(system.inputs)))
-    (group,) = system.state_groups
-    uses = group.uses
-    columns = [q[:, uses["q"]], qd[:, uses["qd"]], 0.0 * qd[:, uses["qd"]], u[:, uses["u"]]]
-    left = np.full((len(t), 1), np.nan)
-    arrays = [np.ascontiguousarray(x) for x in (*columns, p[uses["p"]], t, np.zeros(1))]
-    assert system._code.module(group.module).memory(*arrays, left)
-    assert np.isnan(left[5:]).all()
-    np.testing.assert_allclose(system.memory(q, qd, 0.0 * qd, u, p, t)[5:], 1.0, atol=1e-6)
-
-
 def coarse_beside_fine(
     effect: str, shapes: dict[str, float], hz: float, size: float, step: float, every: int
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from independent.sensors import Conditions
-from independent_runs import run_short
+from independent_runs import STAGES, run_short
 from mistakes import MISTAKES, Case, run_case, set_text
 
 import bampipe
@@ -78,7 +78,7 @@ def inspected(root: Path, *changes: Callable[[Path], None], machine: str = "join
 
 def inspect_session(root: Path) -> SetupResult:
     """What `filter` says of the set-up of the session in a folder."""
-    run = run_short(root / "session", root, mistakes.PIPELINE)
+    run = run_short(root / "session", root, ("ingest", "filter"))
     return SetupResult.read(run.root / "filter/setup.json")
 
 
@@ -125,9 +125,7 @@ def test_a_device_without_a_scale_is_refused(tmp_path: Path) -> None:
 def test_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(tmp_path: Path) -> None:
     independent.record("joint", tmp_path / "session", 31, {}, mistakes.SHORT["joint"])
     MISTAKES["joint"]["encoder reversed"].spoil(tmp_path / "session")
-    stages = '["ingest", "filter", "identify", "validate", "report"]'
-    pipeline = mistakes.PIPELINE.replace('["ingest", "filter"]', stages)
-    reversed_joint = run_short(tmp_path / "session", tmp_path, pipeline)
+    reversed_joint = run_short(tmp_path / "session", tmp_path, (*STAGES, "report"))
     (mistake,) = SetupResult.read(reversed_joint.root / "filter/setup.json").mistakes
     assert mistake.axes == ("joint",)
     assert mistake.error_before["joint"] > 50.0
