@@ -172,7 +172,7 @@ def _doing(motion: Motion, rows: Indices, axis: int, unit: str) -> str:
 
 
 def _size(value: float, unit: str) -> str:
-    """Return a position or speed with two decimals, or in whole mm if metres would show too few."""
+    """Return a position or speed with two decimals, in mm if metres would show too few."""
     if unit == "m" and abs(value) < 0.1:
-        return f"{1e3 * value:.2g} mm"
+        return f"{round(1e3 * value, 2) + 0.0:.4g} mm"
     return f"{round(float(value), 2) + 0.0:.2f} {unit}"

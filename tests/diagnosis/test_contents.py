@@ -77,7 +77,8 @@ def test_every_axis_has_its_worst_window_and_filters_keep_their_order():
     ("value", "unit", "words"),
     [
         (-2e-5, "m", "-0.02 mm"),
-        (-1e-9, "m", "0.00 mm"),
+        (-1e-9, "m", "0 mm"),
+        (0.0996, "m", "99.6 mm"),
         (0.25, "m", "0.25 m"),
         (-0.001, "rad", "0.00 rad"),
         (1.554, "rad", "1.55 rad"),
