@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
-from bampipe.data.quality.clock import SEAM, unroll
+from bampipe.data.quality.clock import goes_on, unroll
 from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, check_columns, interpolated
@@ -183,24 +183,18 @@ def starts_of(raw: RawTrial, clock: str) -> list[int]:
         starts -= {at for at, step in ahead.items() if 0.0 < step < _PAGE * usual}
         begin, rolled = 0, unroll(t)[2]
         moving = [values for name, values in raw.columns.items() if name != clock]
-        # A counter goes on, and so does what it is the time of.
-        rolls = bool(len(rolled)) and all(_goes_on(values, rolled) for values in moving)
+        # Where a counter merely rolls over, the signals continue.
+        rolls = bool(len(rolled)) and all(goes_on(values, rolled) for values in moving)
         for at in () if rolls else np.flatnonzero(np.diff(t) < 0.0) + 1:
             begin = max([start for start in starts if start <= at], default=begin)
             passed = t[at - 1] - t[begin]
-            goes_on = len(t) - at >= _LEAST and bool(np.all(np.diff(t[at : at + _LEAST]) > 0.0))
+            rises = len(t) - at >= _LEAST and bool(np.all(np.diff(t[at : at + _LEAST]) > 0.0))
             back = abs(t[at] - t[begin]) <= _BACK * passed
             # A lone stamp that is wrong leaves those around it in order.
             stays = at >= 2 and at + 1 < len(t) and bool(t[at + 1] < t[at - 2])
-            if at - begin >= _LEAST and back and goes_on and stays:
+            if at - begin >= _LEAST and back and rises and stays:
                 starts.add(int(at))
     return sorted(starts)
-
-
-def _goes_on(values: np.ndarray, rows: np.ndarray) -> bool:
-    """Whether readings (T,) change before ``rows`` no more than anywhere else."""
-    steps = np.abs(np.diff(np.nan_to_num(values)))
-    return bool(np.max(steps[rows - 1]) <= SEAM * np.max(np.delete(steps, rows - 1), initial=0.0))
 
 
 def _place(column: str, entry: TrialEntry) -> tuple[str, str]:

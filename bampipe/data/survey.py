@@ -98,7 +98,7 @@ _BY_UNIT = {
 _SHORT_UNITS = frozenset(["mm", "Nm", "kN", "gf", "mA", "mV"])
 _LONG_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano", "meter"])
 """Units of two letters at the end of a name that are no words, and longer ones that are."""
-_RATE = re.compile(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$")
+_VELOCITY_UNIT = re.compile(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$")
 """Unit of a velocity at the end of a name."""
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _PRESENT = frozenset(["current", "curr", "cur"])
@@ -666,7 +666,7 @@ def _role_by_unit(text: str) -> str:
 
 def _role_by_suffix(name: str) -> str:
     """The role by a unit at the end of a name that says nothing else."""
-    if _RATE.search(name):
+    if _VELOCITY_UNIT.search(name):
         return "velocity"
     suffix = re.split(r"[_\W]+", name)[-1]
     long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _LONG_WORDS
@@ -679,7 +679,7 @@ def _unit(name: str, stated: str, role: str) -> str:
     if stated:
         return "rev/s" if role == "velocity" and unit(stated) == unit("Hz") else stated
     bare = re.sub(r"(\[\d+\]|_\d+)$", "", _FACTOR.sub("", name.translate(_PLAIN)))
-    if role == "velocity" and (rate := _RATE.search(bare)):
+    if role == "velocity" and (rate := _VELOCITY_UNIT.search(bare)):
         return f"{rate[1]}/s"
     parts = re.findall(r"(?:\d+\.(?=\d))?[^\W_]+|[°%]", bare)
     both = ".".join(parts[-2:]) if role == "force" and len(parts) > 2 else ""  # in_lbs, not in_N

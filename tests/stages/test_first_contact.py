@@ -41,9 +41,9 @@ def test_a_rate_above_the_table_is_that_of_its_samples(tmp_path, line: str):
 
 def test_what_json_says_of_a_channel_elsewhere_is_its_own(tmp_path):
     counts = {"angle": np.rint(np.rad2deg(Q) / 0.01), "torque": np.rint(1e3 * TAU)}
-    told = {"angle": {"gain": 0.01, "unit": "deg"}, "torque": {"gain": 0.001, "unit": "Nm"}}
+    channels = {"angle": {"gain": 0.01, "unit": "deg"}, "torque": {"gain": 0.001, "unit": "Nm"}}
     data = {name: values.astype(int).tolist() for name, values in counts.items()}
-    meta = {"fs": 200, "channels": told}
+    meta = {"fs": 200, "channels": channels}
     (tmp_path / "a.json").write_text(json.dumps({"meta": meta, "data": data}))
     session, proposal = proposed(tmp_path)
     assert session["encoders"]["joint"]["unit"] == "0.01 deg" and not proposal.fill_in

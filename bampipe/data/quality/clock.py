@@ -40,8 +40,14 @@ _SMOOTHER = 0.8
 written late; above, the clock was set back."""
 _UNLIKELY_TWICE = 0.1
 """Share of stamps that stand twice once rows are sorted, from which two recordings are mixed."""
-SEAM = 3.0
+_SEAM = 3.0
 """Times the largest step of a position, over which it goes on where a clock was set back."""
+
+
+def goes_on(values: Array, rows: NDArray[np.intp]) -> bool:
+    """Whether readings (T,) change into ``rows`` little more than anywhere else."""
+    steps = np.abs(np.diff(np.nan_to_num(values)))
+    return bool(np.max(steps[rows - 1]) <= _SEAM * np.max(np.delete(steps, rows - 1), initial=0.0))
 
 
 def unroll(t: Array) -> tuple[Array, str, NDArray[np.intp]]:
@@ -60,8 +66,8 @@ def unroll(t: Array) -> tuple[Array, str, NDArray[np.intp]]:
     if len(drops) and len(ahead):
         usual = float(np.median(ahead))
         for where, period in _PERIODS:
-            goes_on = steps[drops] + period
-            near = np.all((goes_on > 0.0) & (goes_on < _NEAR_ROLL * usual))
+            onward = steps[drops] + period
+            near = np.all((onward > 0.0) & (onward < _NEAR_ROLL * usual))
             if near and np.ptp(t) <= period and usual < 0.1 * period:
                 turned = np.cumsum(np.append(0.0, steps < 0.0))
                 return t + period * turned, where, drops + 1
@@ -257,10 +263,9 @@ def put_in_order(table: TrialTable) -> None:
         elif len(falls) == 1:
             at, step = int(falls[0]), float(np.median(np.diff(t)))
             size = t[at] - t[at + 1] + step
-            moved = np.abs(np.diff(positions))
-            goes_on = moved[:, at] <= SEAM * np.delete(moved, at, axis=1).max(axis=1)
+            seam = np.array([at + 1])
             # After a lone stamp that is wrong, the clock is where it was.
-            if (stop - at) * step > 0.5 * size and goes_on.all():
+            if (stop - at) * step > 0.5 * size and all(goes_on(own, seam) for own in positions):
                 t[at + 1 :] += size
                 table.repairs.append(
                     f"the clock is set back by {size:.3g} s at row {table.rows[at + 1]}: bridged"

@@ -281,9 +281,9 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
         )
     if not right and worth is not None:
         return entry(column.name, UNKNOWN) + match.notes.ask(
-            f"the unit of {column.name}, which nothing states: by its weight, {axis.name} turns by"
-            f" 1 rad for {worth.size:.4g} ± {_rounded(worth.sd)} of it; behind a gear, as of"
-            f" {2.0 * np.pi * worth.size:.3g} turns, give unit and gear_ratio",
+            f"the unit of {column.name}, which nothing states: by the weight on {axis.name},"
+            f" 1 rad reads {worth.size:.4g} ± {_rounded(worth.sd)}; for a sensor on the motor side"
+            f" of a gear ({2.0 * np.pi * worth.size:.3g} to a turn), give unit and gear_ratio",
             f"{UNITS}; rev is too",
         )
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
