@@ -141,7 +141,7 @@ def run_free(
     """
     every = motion.inputs(system.inputs)
     u, p = np.ascontiguousarray(every[first : last + 1]), p[: len(system.parameters)]
-    start = np.concatenate([q, qd, system.initial_memory(q, u[0], p)])
+    start = np.concatenate([q, qd, system.initial_memory(q, qd, u[0], p)])
     plant = make_plant(p, len(system.noise), system.sign_widths, max_step=1e-3)
     dt = float(motion.t[1] - motion.t[0])
     x, _ = simulate(system.derivative, plant, start, u, dt, smooth=system.forced)

@@ -33,9 +33,6 @@ _GAP = (1e-3, 0.05)
 """Play, as shares of the travel."""
 _DRIVE = (0.15, 0.85)
 """Inertia of a drive, as shares of that of its axis."""
-_GAPS, _DRIVES = 14, 4
-"""Grid values of play and of the inertia of a drive. In a gap half too wide, impacts come too late
-to fit."""
 _LIGHTEST = 6.0
 """Inertia of an axis over that of its lightest relevant part."""
 _TIME = (2.0, 3.0)
@@ -182,9 +179,7 @@ class MachineScale:
             i = list(self.coordinates).index(item.axes[0])
             travel = max(float(self.highest[i] - self.lowest[i]), 1e-300)
             return SearchRange(low, high, True, largest_spacing=2.0 * np.pi * _WAVES_APART / travel)
-        is_length = item.axes and parameter.unit == self.coordinates[item.axes[0]][0]
-        count = 0 if not item.effect.has_play else _GAPS if is_length else _DRIVES
-        return SearchRange(low, high, True, count=count)
+        return SearchRange(low, high, True, count=parameter.values)
 
     def _sizes(self, item: BoundEffect, parameter: Parameter) -> dict[str, tuple[float, float]]:
         """Return the range of sizes at the target of an effect, by unit."""

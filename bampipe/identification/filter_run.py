@@ -188,7 +188,7 @@ def infer_initial_state(
         q: positions read by the encoders, (n_q,); qd, speed_sd: rates of the mechanism, (n_q,).
     """
     offset = system.offset(q[None], u[None], p)[0]
-    memory = system.initial_memory(q + offset, u, p)
+    memory = system.initial_memory(q + offset, qd, u, p)
     place = np.hypot(2.0 * reading_sd, _SHIFT_KNOWN * offset)
     spread = np.concatenate([place, speed_sd, np.zeros(len(memory))])
     return np.concatenate([q + offset, qd, memory]), spread

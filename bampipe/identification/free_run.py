@@ -191,7 +191,7 @@ def _forgets(system: System, motion: Motion, p: Array) -> bool:
 def _initial_state(system: System, motion: Motion, p: Array) -> Array:
     u = motion.inputs(system.inputs)
     true = motion.of_mechanism(system, u, p[: len(system.parameters)])
-    memory = system.initial_memory(true.q[0], u[0], p)
+    memory = system.initial_memory(true.q[0], true.qd[0], u[0], p)
     return np.concatenate([true.q[0], true.qd[0], memory])
 
 

@@ -228,7 +228,7 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
         "contribution": ("q qd qdd z u p", [expr for expr in added if expr != 0]),
         "offset": ("q u p", e.offset),
         "input_map": ("q u p", [entry for row in e.input_map for entry in row]),
-        "initial_memory": ("q u p", e.initial),
+        "initial_memory": ("q qd u p", e.initial),
         "compensation": ("q qd z u p", [expr for expr in e.compensation if expr != 0]),
     }
     return _print_over_columns(e, results, ())

@@ -253,7 +253,7 @@ def _check_dependence(
     allow("a process noise", noise_force, [*all_symbols, *w], words)
     allow("the applied force", inputs.applied, all_symbols, words)
     allow("the rate of an internal state", rates, states, words)
-    allow("an initial value", initial, [*d.q, *u, *free], "positions, inputs and parameters")
+    allow("an initial value", initial, [*motion, *u, *free], "motion, inputs and parameters")
     symbols_allowed = [*d.q, *prompt_force, *others, d.channel["t"], *free]
     allow("an offset", terms.offset, symbols_allowed, "positions, forces and parameters")
 

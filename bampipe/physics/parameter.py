@@ -51,6 +51,8 @@ class Parameter(NamedDeclaration):
     of it, on either side"""
     searched: bool = True
     """Whether a diagnosis tries several values of it, not the prior"""
+    values: int = Field(default=0, ge=0)
+    """Number of values that it tries first; 0: as many as the width of the range asks for"""
     description: str = Field(default="", description="Meaning, in a few words")
 
     def cross_faults(self) -> Iterator[InputError]:

@@ -390,9 +390,9 @@ class System:
         columns = self._arrays.compensation(q.T, qd.T, z.T, u.T, p)
         return self._on_axes(self.compensated, columns, len(q))
 
-    def initial_memory(self, q: Array, u: Array, p: Array) -> Array:
-        """Internal states at the start of a trial, (n_z,), from the first q (n_q,) and u (n_u,)."""
-        return np.array([float(v) for v in self._arrays.initial_memory(q, u, p)])
+    def initial_memory(self, q: Array, qd: Array, u: Array, p: Array) -> Array:
+        """Internal states (n_z,) at the start of a trial, from its first q, qd (n_q,), u (n_u,)."""
+        return np.array([float(v) for v in self._arrays.initial_memory(q, qd, u, p)])
 
     def memory(
         self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array,
@@ -412,13 +412,14 @@ class System:
             known: states along this very motion, of any model; those found are added.
         """
         out = np.empty((len(q), len(self.memory_names) + len(self.changes)))
-        first = [part.start or 0 for part in parts]
-        z0 = stack_columns(self._arrays.initial_memory(q[first].T, u[first].T, p), len(first))
+        rows = [part.start or 0 for part in parts]
+        start = q[rows].T, qd[rows].T, u[rows].T
+        z0 = stack_columns(self._arrays.initial_memory(*start, p), len(rows))
         known = {} if known is None else known
         for group in self.state_groups:
-            module, start = self._state_modules[group.module], z0[:, group.places]
+            module, first = self._state_modules[group.module], z0[:, group.places]
             along = (q, qd, qdd, u, p, t)
-            out[:, group.places] = group.integrate(module, along, start, self.inputs, parts, known)
+            out[:, group.places] = group.integrate(module, along, first, self.inputs, parts, known)
         for column, place in enumerate(self.changes, len(self.memory_names)):
             for part in parts:
                 out[part, column] = np.gradient(out[part, place], t[part])

@@ -81,7 +81,8 @@ def simulate_moving_trial(
         q_ref, qd_ref, force, slopes[0], slopes[1], system.moved_first,
         natural_frequency=rng.uniform(7.0, 10.0), damping_ratio=1.0, bandwidth=50.0,
     )  # fmt: skip
-    x0 = np.concatenate([q_ref[0], np.zeros(n), system.initial_memory(q_ref[0], u[0], p)])
+    rest = np.zeros(n)
+    x0 = np.concatenate([q_ref[0], rest, system.initial_memory(q_ref[0], rest, u[0], p)])
     pose = q_ref
     # The field J^T K J depends on the pose, which settles after a few iterations.
     for _ in range(4 if viscous else 1):

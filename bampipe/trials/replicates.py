@@ -98,7 +98,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     if _is_motion_given(fitted):
         return Course(motion.q, _required_force(fitted, rate_hz))
     q, qd = _reference(system, p, motion, u, rate_hz)
-    start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
+    start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], qd[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
     forces = system.model.device.forces
     columns = force_columns(system)
@@ -153,7 +153,7 @@ def _lateness(fitted: ModelOnTrial) -> Array:
     found = np.zeros(len(system.model.device.forces))
     if not system.delays:
         return found
-    memory = system.initial_memory(motion.q[0], u[0], p)
+    memory = system.initial_memory(motion.q[0], motion.qd[0], u[0], p)
     x = np.concatenate([motion.q[0], motion.qd[0], memory])
 
     def slope(column: int) -> Array:

@@ -86,7 +86,8 @@ class Case:
         u = np.zeros((len(t), len(system.inputs)))
         for k, name in enumerate(system.model.device.forces):
             u[:, system.inputs.index(name)] = np.interp(t - late[k], t, torque[:, k])
-        start = np.concatenate([np.zeros(4), system.initial_memory(np.zeros(2), u[0], p)])
+        rest = np.zeros(2)
+        start = np.concatenate([rest, rest, system.initial_memory(rest, rest, u[0], p)])
         plant = make_plant(p, len(system.noise), system.sign_widths)
         return simulate(system.derivative, plant, start, u, 1.0 / RATE)[0][:, :2]
 

@@ -101,7 +101,7 @@ EFFECTS = [
     ("states.force", {"rate": "qd"}, "already"),
     ("definitions.force", "qd", "definitions.force: a parameter has this name already"),
     ("states.z = 0; import os", {"rate": "qd"}, "cannot be a name"),
-    ("states.z", {"rate": "qd", "initial": "qd"}, "initial value"),
+    ("states.z", {"rate": "qd", "initial": "qdd"}, "initial value"),
     ("states.z", {"rate": "ddt(qd)"}, "rate of an internal state"),
     ("devices", ["other"], "does not have"),
 ]

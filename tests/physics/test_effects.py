@@ -110,7 +110,7 @@ def test_finite_everywhere(case):
     for p in ends:
         assert np.isfinite(system.required(q, qd, qdd, z, u, p)).all()
         assert np.isfinite(system.applied(q, qd, qdd, z, u, p)).all()
-        assert np.isfinite(system.initial_memory(q[0], u[0], p)).all()
+        assert np.isfinite(system.initial_memory(q[0], qd[0], u[0], p)).all()
 
 
 @pytest.mark.parametrize("case", [c for c in CASES + ELSEWHERE if effect_of(c).dissipative])

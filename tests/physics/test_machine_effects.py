@@ -248,7 +248,7 @@ def test_an_arm_leads_the_motor_that_moves_the_axis_through_play():
     p, t = typical(system), np.arange(0.0, 3.0, 2e-3)
     wanted, rate = 0.05 * (1.0 - np.cos(2.0 * t)), 0.1 * np.sin(2.0 * t)
     u = np.zeros((t.size, len(system.inputs)))
-    start = np.concatenate([[0.0, 0.0], system.initial_memory(np.zeros(1), u[0], p)])
+    start = np.concatenate([[0.0, 0.0], system.initial_memory(np.zeros(1), np.zeros(1), u[0], p)])
     force = [system.inputs.index("force_motor")]
     arm = Arm(wanted[:, None], rate[:, None], force, moved_first=system.moved_first)
     plant = make_plant(p, len(system.noise), system.sign_widths)
