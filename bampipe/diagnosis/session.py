@@ -188,19 +188,22 @@ class Session:
     def replicate_stopping(self, spec: ModelSpec, linearisation: Linearisation) -> list[Array]:
         """Return the residual of a replicate without noise whose friction truly stops, by trial.
 
-        It is zero if the motion is prescribed, or if the simulation diverges. Controllers keep a
-        robot on its path, so that there only the width of the sign changes the friction.
+        It is zero where the motion is kept, or if the simulation diverges. Controllers keep a robot
+        on its path, so that there only the width of the sign changes the friction.
         """
         t, nothing = self.trials, [np.zeros_like(r) for r in linearisation.residual]
-        if keep_motion(linearisation.fitted):
-            return nothing
         if linearisation.system.model.device.robot is not None:
-            return _narrower_friction(linearisation)
+            return (
+                nothing if keep_motion(linearisation.fitted) else _narrower_friction(linearisation)
+            )
+        narrow = system_of(spec.with_sign_widths(_STOPPING_WIDTH))
+        kept = ([ModelOnTrial(narrow, linearisation.p, [m])] for m in linearisation.motions)
+        if any(map(keep_motion, kept)):
+            return nothing
         none = np.zeros(len(linearisation.system.coordinates))
         exact = replace(
             t.sensors, resolution=none, reading_sd=none, force_sd=np.zeros_like(t.sensors.force_sd)
         )
-        narrow = system_of(spec.with_sign_widths(_STOPPING_WIDTH))
         try:
             found = self._replicate(linearisation, narrow, exact, [(self.seed,)])
         except Runaway:

@@ -36,9 +36,9 @@ def find_force_offsets(
 ) -> dict[str, dict[str, float]]:
     """Find the force offset of each trial relative to the mean over the fitted trials.
 
-    Offsets and parameters of the bare device are fitted together, so that neither absorbs the
-    other. Only the trials numbered ``fitted`` determine the parameters; the other trials get their
-    offsets with these parameters.
+    Offsets, parameters of the bare device and functions of the motion are fitted together, so that
+    none absorbs the others. Only the trials numbered ``fitted`` determine them; the other trials
+    get their offsets with these parameters.
 
     Returns:
         Offsets to subtract, N or N.m, by trial and force; empty if they are not significant.
@@ -57,14 +57,16 @@ def find_force_offsets(
     seen = [trials[number] for number in fitted]
     own = np.sum([one.own for one in seen], axis=0)
     whole = np.sum([one.whole for one in seen], axis=0)
-    if not _still_told(seen, own, whole):
+    common = _beside_common_offset(seen, whole)
+    if not _still_told(*(np.diag(x)[: stacked[0].slope.shape[2]] for x in (own, common, whole))):
         return {}
-    step = np.append(np.linalg.lstsq(own[:-1, :-1], -own[:-1, -1], rcond=1e-9)[0], 1.0)
+    step, step_without = _fit(own), _fit(common)
     offsets = np.array([one.offset @ step for one in trials])
     mean = offsets[list(fitted)].mean(axis=0)
     plain = np.abs(offsets - mean) / [one.error(step) for one in trials]
     chosen = np.median(plain[list(fitted)], axis=0) > _PLAIN
-    if step @ own @ step > _LEAVES * whole[-1, -1] or not chosen.any():
+    left, without = step @ own @ step, step_without @ common @ step_without
+    if left > _LEAVES * without or not chosen.any():
         return {}
     return {
         name: {
@@ -81,11 +83,11 @@ class _Trial:
     """Least-squares offsets of one trial, as linear functions of the parameter step and 1.
 
     Attributes:
-        offset: (n_force, n_free + 1) coefficients of the offsets; parts: the same for each part.
-        whole: (n_free + 1, n_free + 1) products of slopes and residual, in units of the error of
-            each axis; own: the same after the trial's offsets have been projected out.
-        common: (n_force, n_free + 1) and (n_force, n_force), the products from which a common
-            offset of several trials is projected out.
+        offset: (n_force, n + 1) coefficients of the offsets; parts: the same for each part.
+        whole: (n + 1, n + 1) products of slopes, functions of the motion and residual, in units of
+            the error of each axis; own: the same after the trial's offsets are projected out.
+        common: (n_force, n + 1) and (n_force, n_force), the products from which a common offset of
+            several trials is projected out.
     """
 
     offset: Array
@@ -102,7 +104,8 @@ class _Trial:
         rows = band.thinned_rows(motion.t.size)
         gains = system.input_map(motion.q[rows], motion.inputs(system.inputs)[rows], p)
         weight = (one.used / size)[:, :, None]
-        both = np.concatenate([one.slope, one.residual[:, :, None]], axis=2) * weight
+        columns = [one.slope, _functions_of_motion(motion, band), one.residual[:, :, None]]
+        both = np.concatenate(columns, axis=2) * weight
         both, forces = (x.reshape(-1, x.shape[2]) for x in (both, gains * weight))
 
         def solve(rows: Indices | slice) -> Array:
@@ -125,10 +128,34 @@ class _Trial:
         return np.asarray(np.maximum(sd, np.finfo(float).tiny))
 
 
-def _still_told(trials: Sequence[_Trial], own: Array, whole: Array) -> bool:
-    """Whether parameters identifiable beside a common offset remain so beside one by trial."""
+def _functions_of_motion(motion: Motion, band: Band) -> Array:
+    """Return what a missing effect may add on each axis, (K, n_q, 3 n_q).
+
+    Friction that differs by direction and springs have a mean that differs between trials.
+    """
+    n = motion.q.shape[1]
+    out = np.zeros((len(band.thinned_rows(len(motion.t))), n, n, 3))
+    for axis, (q, qd) in enumerate(zip(motion.q.T, motion.qd.T, strict=True)):
+        out[:, axis, axis] = band.thin(np.column_stack([np.abs(qd), q, q**2]), [axis] * 3)
+    return out.reshape(len(out), n, 3 * n)
+
+
+def _fit(products: Array) -> Array:
+    """Return the step that minimises the error, and 1, from products as in `_Trial.own`."""
+    size = 1.0 / np.sqrt(np.maximum(products.diagonal(), 1e-300))
+    scaled = products * size * size[:, None]
+    step = np.linalg.lstsq(scaled[:-1, :-1], -scaled[:-1, -1], rcond=1e-9)[0]
+    return np.append(step * size[:-1] / size[-1], 1.0)
+
+
+def _beside_common_offset(trials: Sequence[_Trial], whole: Array) -> Array:
+    """Return the products of all trials after one common offset has been projected out."""
     across = np.sum([one.common[0] for one in trials], axis=0)
     squared = np.sum([one.common[1] for one in trials], axis=0)
-    common = np.diag(whole - across.T @ np.linalg.lstsq(squared, across, rcond=1e-9)[0])[:-1]
-    counts = common > _TOLD * np.diag(whole)[:-1]
-    return bool(np.all(np.diag(own)[:-1][counts] > _STILL_TOLD * common[counts]))
+    return np.asarray(whole - across.T @ np.linalg.lstsq(squared, across, rcond=1e-9)[0])
+
+
+def _still_told(own: Array, common: Array, whole: Array) -> bool:
+    """Whether parameters identifiable beside a common offset remain so beside one by trial."""
+    counts = common > _TOLD * whole
+    return bool(np.all(own[counts] > _STILL_TOLD * common[counts]))

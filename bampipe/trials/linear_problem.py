@@ -14,7 +14,7 @@ from bampipe.physics.parameter import Parameter
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.likelihood import Likelihood
 from bampipe.trials.linearisation import Linearisation
-from bampipe.trials.samples import MOST_STOPPING, take_samples
+from bampipe.trials.samples import MOST_BIAS, take_samples
 
 NOTHING = 1e-4
 """A parameter whose whole range moves the data by fewer standard deviations has no effect."""
@@ -63,8 +63,8 @@ def pose_problem(likelihood: Likelihood, linearisation: Linearisation) -> Linear
     n_timing, none = len(of_timing), np.zeros(n_q)
     precision = np.concatenate([linearisation.precision, of_timing, none + 1.0, none + 1.0])
     known = np.concatenate([linearisation.known, np.zeros(n_timing), none + 1.0, none])
-    lower = np.concatenate([linearisation.lower, timing[:1], none - np.inf, none])
-    upper = np.concatenate([linearisation.upper, timing[1:], none + np.inf, none + MOST_STOPPING])
+    lower = np.concatenate([linearisation.lower, timing[:1], none, none])
+    upper = np.concatenate([linearisation.upper, timing[1:], none + MOST_BIAS, none + MOST_BIAS])
     y = [
         take_samples(linearisation.residual, here, axis) * weights[axis]
         for axis, here in enumerate(samples)

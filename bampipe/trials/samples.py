@@ -13,7 +13,7 @@ from bampipe.trials.linearisation import Linearisation
 
 _SPEEDS = 12
 """Classes of speed in which the variance of replicates is averaged, finer at low speeds."""
-MOST_STOPPING = 1.5
+MOST_BIAS = 1.5
 """Upper bound of gamma, the factor of the stopping bias."""
 
 
@@ -89,7 +89,7 @@ class Noise:
         both = np.column_stack([b, c]) / np.sqrt(self.variance[axis] + 1e-300)[:, None]
         target = y / np.sqrt(self.variance[axis] + 1e-300)
         factor = np.linalg.lstsq(both, target, rcond=1e-6)[0][1] if len(y) else 0.0
-        square = b**2 + (np.clip(factor, 0.0, MOST_STOPPING) * c) ** 2
+        square = b**2 + (np.clip(factor, 0.0, MOST_BIAS) * c) ** 2
         count = np.maximum(np.bincount(at, minlength=_SPEEDS), 1)
         return np.asarray(0.5 * (square + (np.bincount(at, square, minlength=_SPEEDS) / count)[at]))
 

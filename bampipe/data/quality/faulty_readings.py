@@ -234,8 +234,8 @@ def _sides(motions: list[SmoothedMotion]) -> Array:
     """What a drive is regressed on, (T, P)."""
     sides = [np.ones(len(motions[0].position))]
     for motion in motions:
-        angle = motion.position
-        sides += [*motion.moving.T, angle, np.sin(angle), np.cos(angle)]
+        angle, by_direction = motion.position, np.abs(motion.moving[:, 1])
+        sides += [*motion.moving.T, by_direction, angle, np.sin(angle), np.cos(angle)]
     return np.column_stack(sides)
 
 
