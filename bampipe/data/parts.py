@@ -1,9 +1,11 @@
 """Which files of a folder are parts of one recording, by their names, lengths and clocks."""
 
 import re
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import and_
 from pathlib import Path
 from typing import Literal, cast
 
@@ -72,21 +74,22 @@ def join_parts(
     kinds = {name: (frozenset(columns), said[name]) for name, columns in found.items()}
     # Words that all files of a kind have; numbers, if there are several, tell trials apart.
     own = {
-        kind: frozenset.intersection(*(frozenset(_words(n)) for n in found if kinds[n] == kind))
+        kind: reduce(and_, (Counter(_words(n)) for n in found if kinds[n] == kind))
         for kind in set(kinds.values())
     }
-    shared = frozenset.intersection(*own.values())
+    shared = reduce(and_, own.values())
     groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, kind in kinds.items():
-        words = (w for w in _words(name) if w not in said[name] and w not in own[kind])
-        groups[tuple(words)].append(name)
+        words = Counter(w for w in _words(name) if w not in said[name]) - own[kind]
+        groups[tuple(words.elements())].append(name)
     trials, reasons = [], []
     for names in groups.values():
         if len({kinds[name] for name in names}) != len(names) or len(names) < 2:
             continue
         called: dict[str, str] = {}
         for n in names:
-            name = _called(_words(n), own[kinds[n]] - shared, said[n])
+            beyond = own[kinds[n]] - shared
+            name = _called([w for w in own[kinds[n]] if w in beyond or w in said[n]])
             called[n] = f"{name}_{len(called)}" if name in called.values() else name
         roles = {n: {role(f"{called[n]}:{c}", u) for c, u in found[n].items()} for n in names}
         main = max(names, key=lambda n: ("position" in roles[n], -names.index(n)))
@@ -132,9 +135,9 @@ def _words(name: str) -> list[str]:
     return [part.lower() for part in parts]
 
 
-def _called(words: Sequence[str], own: frozenset[str], said: Sequence[str]) -> str:
-    """Name of a part: what its kind of file has in its name and other kinds have not."""
-    name = "_".join(dict.fromkeys(w for w in words if w in own or w in said))
+def _called(words: Iterable[str]) -> str:
+    """Name of a part, by the words that its kind of file has in its name and other kinds have not."""
+    name = "_".join(words)
     return name[:_LONGEST] if re.match("[a-z]", name) else f"part_{name}".rstrip("_")[:_LONGEST]
 
 

@@ -93,7 +93,8 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
         with located(f"{what} '{column}'"):
             values[column] = _read_column(array, index, wanted.datetimes.get(column))
         units |= {column: array.unit} if array.unit else {}
-    starts = next((begun[column] for column in wanted.columns if column in begun), ())
+    called = (split_index(column, known)[0] for column in wanted.columns)
+    starts = next((begun[name] for name in called if name in begun), ())
     return RawTrial(aligned(values, what), first_row=1, units=units, begun=starts)
 
 
@@ -269,24 +270,29 @@ def _join_runs(arrays: Arrays) -> tuple[dict[str, Stored], dict[str, tuple[int, 
     runs: dict[str, dict[str, str]] = {}
     for label, array in found.items():
         match = _RUN.fullmatch(label)
-        if match and len(labels("", array.shape)) == 1 < math.prod(array.shape):
-            runs.setdefault(f"{match[1]}[:].{match[4]}", {})[match[2] or match[3]] = label
+        if match and labels("", array.shape) and math.prod(array.shape) > 1:
+            runs.setdefault(f"{match[1]}[:].{match[4]}", {})[match[3] or f"[{match[2]}]"] = label
     timed = {name.partition("[")[0]: list(own) for name, own in runs.items() if _TIMES.search(name)}
     for name, own in runs.items():
         parts = [found[label] for label in own.values()]
         sizes = [math.prod(part.shape) for part in parts]
         times = timed.get(name.partition("[")[0])
-        alike = len(set(sizes)) == 1 and times is None
-        if alike or len(own) < 2 or list(own) != (times or list(own)):
+        # Groups that are called trials are no joints, whatever their lengths.
+        alike = len(set(sizes)) == 1 and times is None and not all(map(str.isdigit, own))
+        widths = {len(labels("", part.shape)) for part in parts}
+        if alike or len(widths) > 1 or len(own) < 2 or list(own) != (times or list(own)):
             continue
         found = {label: array for label, array in found.items() if label not in own.values()}
-        found[name] = replace(parts[0], shape=(sum(sizes),), load=partial(_end_to_end, parts))
-        begun[name] = tuple(accumulate(sizes[:-1]))
+        width = widths.pop()
+        shape = (sum(sizes) // width, *([width] if width > 1 else []))
+        found[name] = replace(parts[0], shape=shape, load=partial(_end_to_end, parts, shape))
+        begun[name] = tuple(accumulate(size // width for size in sizes[:-1]))
     return found, begun
 
 
-def _end_to_end(parts: Iterable[Stored]) -> np.ndarray:
-    return np.concatenate([part.load().ravel() for part in parts])
+def _end_to_end(parts: Iterable[Stored], shape: tuple[int, ...]) -> np.ndarray:
+    tables = (part.load().reshape(-1, *shape[1:]) for part in parts)
+    return np.concatenate([*tables])
 
 
 @dataclass(frozen=True)
@@ -327,17 +333,27 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     found: dict[str, Stored] = {}
     units = units_beside({x: str(a.ravel()[0]) for x, a in whole.items() if a.size == 1})
     for key, array in whole.items():
-        fields = array.dtype.names
-        parts = {f"{key}.{part}": array[part] for part in fields} if fields else {key: array}
-        found |= {n: stored(np.atleast_1d(x), units.get(n, "")) for n, x in parts.items()}
-    blocks = [(name, array.shape) for name, array in found.items() if len(array.shape) > 2]
-    if wanted is None and blocks and len(blocks) == len(found):
+        parts = _fields(key, array)
+        found |= {n: stored(np.atleast_1d(x), units.get(n, "")) for n, x in parts}
+    sampled = [array.shape for array in found.values() if math.prod(array.shape) > LARGEST_WIDTH]
+    blocks = [
+        (name, array.shape) for name, array in found.items() if len(labels("", array.shape)) == 0
+    ]
+    if wanted is None and blocks and len(blocks) == len(sampled):
         name, shape = blocks[0]
         raise InputError(
             f"'{name}' is a {_by(shape)} array, of which no side is said to be the samples",
             remedy="save each trial as an array of its own, samples by channels",
         )
     yield found, ()
+
+
+def _fields(name: str, array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """An array of numbers itself; of records, what is in them."""
+    if array.dtype.names is None:
+        yield name, array
+    for field in array.dtype.names or ():
+        yield from _fields(f"{name}.{field}", array[field])
 
 
 READER = ArrayReader("array", _opened)

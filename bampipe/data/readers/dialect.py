@@ -396,6 +396,9 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
     for _, width, delimiter in (each for each in ranked if each[0] >= _ALIKE * best):
         split = [cells(line.text, delimiter) for line in lines]
         numbers = [_number_cells(row, delimiter) if len(row) == width else 0 for row in split]
+        worded = [re.match(r"[^\W\d_]", row[0]) is not None if row else False for row in split]
+        if 2 * sum(worded) < len(split):  # where samples begin with a number
+            numbers = [0 if word else n for n, word in zip(numbers, worded, strict=True)]
         samples = [
             [n for n, row in enumerate(split) if numbers[n] > 0.5 * of(row)]
             for of in (len, lambda row: sum(map(bool, row)))  # of cells, or of those with something
@@ -431,13 +434,17 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
     width, above = len(cells(lines[first].text, delimiter)), _filled(lines[:first])[-4:]
     bare = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above}
     rows = {n: _trimmed(row, width) for n, row in bare.items()}
-    for n, row in rows.items():
+    for n in above[-2:]:
+        row = rows[n]
         if not width - 1 <= len(row) <= width:
             rows[n] = next(iter(_otherwise(lines[n].text, width)), row)
+    # Below the names stands nothing with fewer cells: that is what a logger says as it starts.
+    apart = [n for n, row in rows.items() if len(row) < width - 1 and not _is_remark(lines[n].text)]
     fitting = [
         n
         for n, row in rows.items()
         if width - 1 <= len(row) <= width
+        and n > max(apart, default=-1)
         and not all(map(_POINT.match, row))
         and all(any(map(str.isalnum, cell)) for cell in row if cell)
     ]

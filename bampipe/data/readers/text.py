@@ -138,12 +138,18 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
 
 
 def _sheet(file: BinaryIO) -> BinaryIO:
-    """The sheet of a workbook that has most rows, as CSV; InputError without openpyxl."""
+    """The sheets of a workbook that have the header of the longest, as CSV, one below the other.
+
+    InputError without openpyxl.
+    """
     book = need("openpyxl", "xlsx").load_workbook(file, read_only=True, data_only=True)
-    sheets = ([*sheet.iter_rows(values_only=True)] for sheet in book.worksheets)
-    rows = max(sheets, key=len, default=[])
+    sheets = [[*sheet.iter_rows(values_only=True)] for sheet in book.worksheets]
+    longest = max(sheets, key=len, default=[])
+    named = [row for row in longest if sum(isinstance(cell, str) for cell in row) > 1][:1]
     text = io.StringIO(newline="")
-    csv.writer(text).writerows(rows)
+    for rows in sheets if named else [longest]:
+        if rows is longest or named[0] in rows:
+            csv.writer(text).writerows(rows)
     return io.BytesIO(text.getvalue().encode())
 
 

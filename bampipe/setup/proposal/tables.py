@@ -35,8 +35,9 @@ _SLOW_HZ = 40.0
 _OF_ROWS = "the logger's set-up has it; else the number of rows over the seconds that they took"
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
 _SURE, _NEAR = 2.0, 0.025
-"""Standard errors, and share, within which a power of two, as most encoders count, is what a turn
-counts."""
+"""Standard errors, and share, within which a number as most encoders count is what a turn counts."""
+_ROUND = [digits * 10.0**n for digits in (1, 2, 3.6, 4, 5, 8) for n in (3, 4)]
+_COUNTS = [*(2.0**n for n in range(8, 25)), *_ROUND]
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "kip", "V")
 _LOGGER = "its manual, or ask who wrote the logger"
@@ -64,8 +65,9 @@ class ProposedClock:
 
 def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     """Propose a clock: by stamps in one column or two, else by counting samples."""
-    counters = [c for c in found.columns if not c.role and not _COUNTERS.isdisjoint(words(c.name))]
-    unnamed = [c for c in found.columns if not c.role and c not in counters and _counts_on(c)]
+    unsaid = [c for c in found.columns if not c.role and np.any(np.diff(c.values) != 1.0)]
+    counters = [c for c in unsaid if not _COUNTERS.isdisjoint(words(c.name))]
+    unnamed = [c for c in unsaid if c not in counters and _counts_on(c)]
     whole = [c for c in found.of("time") if c.is_integer]
     for rest in reversed(whole):
         for seconds in reversed(whole):
@@ -93,7 +95,7 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     named_unit = next((u for u in ("us", "ms", "ns", "min") if u in words(column.name)), "")
     counter = not _COUNTERS.isdisjoint(words(column.name)) or column.role != "time"
     plain = spelled(column.unit, tuple(SECONDS)) in SECONDS
-    counter &= not named_unit and not plain
+    counter &= column.is_integer and not named_unit and not plain
     kind = "" if counter else guesses.time_unit(stamps + start, column.unit or named_unit)
     written = f"{column.name} {column.unit}"
     tick = re.search(r"(?<![\d.])(\d*\.?\d+) ?_?(ns|us|ms)(?![A-Za-z])", written)
@@ -190,9 +192,9 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
 
 
 def _counts_on(column: SurveyedColumn) -> bool:
-    """Whether a column whose name says nothing rises evenly, otherwise than as a number of rows."""
+    """Whether a column whose name says nothing rises evenly."""
     steps = np.diff(column.values)
-    return guesses.is_time(column.values) and bool(np.ptp(steps) < np.median(steps) != 1.0)
+    return guesses.is_time(column.values) and bool(np.ptp(steps) < np.median(steps))
 
 
 def _numbers_rows(column: SurveyedColumn) -> bool:
@@ -343,11 +345,11 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
     worth = match.turning.get(column.name)
     if worth is not None:
         turn, sd = 2.0 * np.pi * worth.size, 2.0 * np.pi * worth.sd
-        power = 2.0 ** round(np.log2(turn))
-        is_power = abs(turn - power) < max(_SURE * sd, _NEAR * power)
-        size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}"
-        scale_sd = "" if is_power else f", scale_sd = {_rounded(sd / turn)}"
-        taken = f" ({power:.0f}, a power of two, is taken)" if is_power else ""
+        usual = min(_COUNTS, key=lambda counts: abs(turn - counts))
+        is_usual = abs(turn - usual) < max(_SURE * sd, _NEAR * usual)
+        size = f"{(usual if is_usual else turn) / (2.0 * np.pi):.6g}"
+        scale_sd = "" if is_usual else f", scale_sd = {_rounded(sd / turn)}"
+        taken = f" ({usual:.0f}, as encoders have, is taken)" if is_usual else ""
         return count(size, worth.zero, scale_sd) + match.notes.guess(
             f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}{taken}, and"
             f" {worth.zero:.0f} where it hangs, by its weight, which goes with the sine of the"
