@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import scipy.io
 
+from bampipe.data.names import words
 from bampipe.data.quality.encoders import unwrapped
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.recording import describe_spans, read_recording
 from bampipe.data.session import Clock, TrialEntry
-from bampipe.data.survey import survey, words
+from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.setup.proposal import propose
 

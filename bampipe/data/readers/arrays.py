@@ -18,9 +18,17 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.data.readers.trial import (
+    RawTrial,
+    Wanted,
+    aligned,
+    check_columns,
+    check_size,
+    interpolated,
+)
 from bampipe.data.units import SCALES, in_steps, units_beside
 from bampipe.errors import InputError, located
+from bampipe.lists import join_names
 
 LARGEST_WIDTH = 64
 _RUN = re.compile(
@@ -81,7 +89,8 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
     arrays = _in_steps(arrays)
     units = {name: array.unit for name, array in arrays.items() if array.kind == STATED}
     arrays = {name: array for name, array in arrays.items() if name not in units}
-    joined, begun = _join_runs(arrays)
+    at_one_rate = _at_one_rate(arrays)
+    joined, begun = _join_runs(at_one_rate)
     known: Arrays = {**arrays, **joined}
     values = dict[str, np.ndarray]()
     for column in wanted.columns:
@@ -95,7 +104,10 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
         units |= {column: array.unit} if array.unit else {}
     called = (split_index(column, known)[0] for column in wanted.columns)
     starts = next((begun[name] for name in called if name in begun), ())
-    return RawTrial(aligned(values, what), first_row=1, units=units, begun=starts)
+    own = [c for c in wanted.columns if at_one_rate.get(c) is not arrays.get(c)]
+    said = f"interpolated linearly at the times of the longest: {join_names(own)}"
+    remarks = (said,) if own else ()
+    return RawTrial(aligned(values, what), 1, remarks=remarks, units=units, begun=starts)
 
 
 def _read_column(array: Stored, index: int | None, form: str | None) -> np.ndarray:
@@ -138,7 +150,7 @@ def columns_of_arrays(arrays: Arrays) -> dict[str, str]:
     And of numbers that stand alone. Beside a log a file may keep what belongs to no sample: gains
     by axis, a table of settings.
     """
-    joined = _join_runs(_in_steps(arrays))[0]
+    joined = _join_runs(_at_one_rate(_in_steps(arrays)))[0]
     found = {name: array for name, array in joined.items() if array.kind in _NUMBERS + "M"}
     by_length: dict[int, list[str]] = {}
     for name, array in found.items():
@@ -256,6 +268,47 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     if len(sides) < 2:
         return [name]
     return [f"{name}[{k}]" for k in range(min(sides))] if min(sides) <= LARGEST_WIDTH else []
+
+
+def _at_one_rate(arrays: Arrays) -> Arrays:
+    """The arrays, those of signals with fewer samples between theirs at the times of the longest.
+
+    Of groups that each have a time, and one signal or others than the rest; else they are trials.
+    """
+    groups: dict[str, dict[str, str]] = {}
+    for name, array in arrays.items():
+        owner, dot, key = name.rpartition("/" if "/" in name else ".")
+        sampled = array.kind in _NUMBERS and labels("", array.shape) and math.prod(array.shape) > 1
+        if dot and sampled and not _RUN.fullmatch(name):
+            groups.setdefault(owner, {})[key] = name
+    timed: dict[str, list[str]] = {}
+    kinds = []
+    for own in groups.values():
+        if clock := next((name for key, name in own.items() if _CLOCK.match(key)), ""):
+            shape = arrays[clock].shape
+            timed[clock] = [
+                x for x in own.values() if arrays[x].shape[:1] == shape[:1] and x != clock
+            ]
+            kinds.append(frozenset(own))
+    several = len(timed) > 1 and (len({*kinds}) == len(kinds) or {*map(len, timed.values())} == {1})
+    longest = max(timed, key=lambda clock: arrays[clock].shape, default="")
+    found = dict(arrays)
+    for clock, names in timed.items() if several else ():
+        if arrays[clock].shape == arrays[longest].shape or not names:
+            continue
+        del found[clock]
+        for name in names:
+            shape = (*arrays[longest].shape[:1], *arrays[name].shape[1:])
+            load = partial(_resampled, *(arrays[x] for x in (longest, clock, name)))
+            found[name] = replace(arrays[name], shape=shape, load=load)
+    return found
+
+
+def _resampled(at: Stored, times: Stored, values: Stored) -> np.ndarray:
+    t, own = at.load().astype(float).ravel(), times.load().astype(float).ravel()
+    table = values.load().astype(float)
+    columns = [interpolated(t, own, column) for column in table.reshape(len(own), -1).T]
+    return np.column_stack(columns).reshape(len(t), *table.shape[1:])
 
 
 def _join_runs(arrays: Arrays) -> tuple[dict[str, Stored], dict[str, tuple[int, ...]]]:

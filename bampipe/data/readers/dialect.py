@@ -133,6 +133,10 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     # Not the joint whose name was put in brackets.
     units = {h: u for h, u in units_in(header).items() if dialect.names or u in named}
     units |= _units_of_motion([line.text for line in lines[:index]], header)
+    for line in lines[: max(index, 0)]:
+        key, *said = cells(line.text, delimiter) or [""]
+        if len(said) == len(header) - 1 and re.search(r"(?i)\bunits?:?\Z", key):
+            units = {h: u for h, u in zip(header[1:], said, strict=True) if u} | units
     remarks, scales = [], dict[str, float]()
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
@@ -330,6 +334,10 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
         groups = cells(above[-2].text, delimiter) if apart and len(above) > 1 else []
         groups = groups if len(groups) == len(row) else [""] * len(row)
         row = [a or f"{g} {b}".strip() for a, b, g in zip(row, beside, groups, strict=True)]
+    if beside and len(beside) == len(row) and re.match(r"(?i)labels?\b", beside[0]):
+        row = [
+            f"{name} {label}".strip() for name, label in zip(row, ["", *beside[1:]], strict=True)
+        ]
     if _is_key_of_names(row):
         row = ["Time" if name == row[0] else name for name in row]
     row = _named_items(row, rows, delimiter)

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from pyarrow import dataset
 
 from bampipe.data.readers import lerobot, moments
-from bampipe.data.readers.arrays import ArrayReader, Opened, Stored
+from bampipe.data.readers.arrays import LARGEST_WIDTH, ArrayReader, Opened, Stored
 from bampipe.data.readers.nested import leaves
 from bampipe.data.readers.trial import NUMBER, RawTrial, Wanted
 from bampipe.data.units import SCALES, in_steps, units_beside
@@ -26,6 +26,8 @@ _KINDS = {
     "O": (pa.types.is_date, pa.types.is_string, pa.types.is_large_string),
 }
 """Kinds of arrays, as NumPy has them, by what tells the type of a column."""
+_MOST_TRIALS = 1000
+"""Rows of a table with a trial each."""
 
 
 @contextmanager
@@ -56,8 +58,18 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         if size := [float(text) for text in sizes if re.fullmatch(NUMBER, text)]:
             said = in_steps(load(), size, said)
         found[field.name] = Stored((rows,), kind, load, said)
-    for name, (vector, place) in lerobot.vector_columns(path, schema).items():
+    vectors, long = lerobot.vector_columns(path, schema), set[str]()
+    for name, (vector, place) in vectors.items():
+        if place >= LARGEST_WIDTH:
+            long.add(vector)
         found[name] = Stored((rows,), "f", partial(_cells, read_column, vector, place))
+    for name in sorted(long) if rows <= _MOST_TRIALS else ():  # a trial a row
+        sizes = pc.list_value_length(read_column(name)).to_pylist()
+        for k, size in enumerate(sizes):
+            found[f"trial{k}.{name}"] = Stored(
+                (size,), "f", partial(_cells, read_column, name, row=k)
+            )
+    found = {name: held for name, held in found.items() if vectors.get(name, ("",))[0] not in long}
     yield found, ()
 
 
@@ -77,10 +89,15 @@ def columns(path: Path) -> dict[str, str]:
 
 
 def _cells(
-    read_column: Callable[[str], pa.ChunkedArray], name: str, place: int | None = None
+    read_column: Callable[[str], pa.ChunkedArray],
+    name: str,
+    place: int | None = None,
+    row: int | None = None,
 ) -> np.ndarray:
-    """A column, or an element of its vectors, (T,): numbers, moments or texts."""
+    """A column, or an element of its vectors, or that of a row, (T,): numbers, moments or texts."""
     cells = read_column(name)
+    if row is not None:
+        return np.asarray(cells[row].values.to_numpy(zero_copy_only=False))
     if place is not None:
         cells = pc.list_element(cells, place)
     if pa.types.is_timestamp(cells.type) or pa.types.is_date(cells.type):

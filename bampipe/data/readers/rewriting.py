@@ -319,7 +319,7 @@ def _without_unit(cell: str, end: str) -> list[str]:
 
 
 def _named_lists(rows: list[list[str]], widths: Sequence[int]) -> list[list[str]]:
-    """What the items of cells that are lists are called: by a list of names beside them, or by number.
+    """What items of cells that are lists are called: by a list of names, or by number.
 
     Nothing of other cells.
     """

@@ -90,7 +90,9 @@ def above_samples(path: Path) -> str:
 def is_table(path: Path) -> bool:
     """Whether a file of an unknown extension is text with rows of numbers."""
     try:
-        with path.open("rb") as stream:
+        with path.open("rb") as file:
+            _head(file)
+        with _opened(path, Dialect()) as (stream, _, _):
             return dialects.share_of_rows(_head(stream)) > _MANY_ROWS
     except (OSError, InputError):
         return False

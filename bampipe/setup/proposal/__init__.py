@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.names import DRIVERS, words
 from bampipe.data.readers import lerobot
-from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, survey, words
+from bampipe.data.survey import Survey, SurveyedColumn, survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.lists import join_names

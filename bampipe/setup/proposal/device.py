@@ -10,8 +10,9 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.chain import Branches
 from bampipe.data.device_file import complete_device, read_device_file
+from bampipe.data.names import REFERENCE_WORDS, words
 from bampipe.data.readers import is_text
-from bampipe.data.survey import REFERENCE_WORDS, Survey, SurveyedColumn, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit
 from bampipe.data.urdf import unexpanded
 from bampipe.errors import InputError

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.names import DRIVERS, REFERENCE_WORDS, words
 from bampipe.data.session import Register
-from bampipe.data.survey import DRIVERS, REFERENCE_WORDS, Survey, SurveyedColumn, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import is_of_motor, travelled
 from bampipe.setup.proposal.robot import RobotColumns

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.names import DRIVERS, words
 from bampipe.data.quality.clock import find_fresh_rows
 from bampipe.data.quality.encoders import integral, unwrapped
 from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_spikes
 from bampipe.data.session import Register
-from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit
 from bampipe.setup.proposal.notes import Notes
 

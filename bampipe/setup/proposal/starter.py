@@ -7,7 +7,8 @@ import numpy as np
 
 from bampipe.data.angle_torque import Reading
 from bampipe.data.guesses import Driven
-from bampipe.data.survey import REFERENCE_WORDS, Survey, SurveyedColumn, words
+from bampipe.data.names import REFERENCE_WORDS, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit as unit_named
 from bampipe.physics.device import KINDS
 from bampipe.physics.expression import FUNCTIONS

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.names import words
 from bampipe.data.quality.clock import spread_stamps, unroll
 from bampipe.data.session import SECONDS, Register
 from bampipe.data.stated_rate import interval_of
-from bampipe.data.survey import Survey, SurveyedColumn, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import bare, spelled, unit
 from bampipe.errors import InputError
 from bampipe.lists import join_names
@@ -35,7 +36,7 @@ _SLOW_HZ = 40.0
 _OF_ROWS = "the logger's set-up has it; else the number of rows over the seconds that they took"
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
 _SURE, _NEAR = 2.0, 0.025
-"""Standard errors, and share, within which a number as most encoders count is what a turn counts."""
+"""Standard errors, and share, within which a number that encoders have is what a turn counts."""
 _ROUND = [digits * 10.0**n for digits in (1, 2, 3.6, 4, 5, 8) for n in (3, 4)]
 _COUNTS = [*(2.0**n for n in range(8, 25)), *_ROUND]
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
