@@ -27,7 +27,7 @@ from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS
 from bampipe.data.session.file import lexically_inside
-from bampipe.data.stated_rate import intervals_stated
+from bampipe.data.stated_rate import intervals_stated, units_stated
 from bampipe.data.units import RecordedUnit, spelled, unit
 from bampipe.errors import InputError
 from bampipe.lists import join_names
@@ -51,6 +51,7 @@ _SMALL = 1 << 16
 """Bytes below which a text may be no log but a line of results."""
 _MOST_SCANNED = 1 << 30
 """Bytes of text in which other recordings are looked for; reading them takes some seconds."""
+_OTHER = "other columns, for another session"
 _WHOLE = 2
 """Of logs that hold both a motion and what drives it."""
 _RISES = 0.8
@@ -156,6 +157,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     dataset = lerobot.open_dataset(folder, episodes)
     logs = _Logs(folder, Dialect(names=tuple(names)), dataset)
     logs.look_through([folder / file for file in dataset.episodes] if dataset else logs.paths())
+    logs.hear_notes()
     trials, common = logs.choose()
     read: tuple[SurveyedColumn, ...] = ()
     sound = []
@@ -255,6 +257,17 @@ class _Logs:
         if not self.found:
             raise self.fault()
 
+    def hear_notes(self) -> None:
+        """Give columns that state no unit that of notes beside the logs."""
+        known = {(c, u) for own in self.found.values() for c, u in own.items()}
+        unsaid = {c for c, u in known if not u and not unit_of(c, "", role_of(c, ""))}
+        said = units_stated(self.folder, self.found, unsaid)
+        self.found = {
+            name: {c: u or said.get(c, ("", ""))[0] for c, u in own.items()}
+            for name, own in self.found.items()
+        }
+        self.remarks += [f"{c} is in {u}, as {file} says" for c, (u, file) in sorted(said.items())]
+
     def _read_one(self, name: str, columns: Mapping[str, str], *wanted: str) -> RawTrial:
         moments = {column: "" for column in wanted if columns[column] == "datetime"}
         return read_trial(
@@ -309,12 +322,34 @@ class _Logs:
             others = [name for name in names if axes[name] != axis]
             self._leave_out(others, f"not of {axis}, by name: for another session")
             names = [name for name in names if name not in others]
-        self._leave_out(self.found.keys() - set(names))
-        return [TrialEntry(file=n, kind="free") for n in names], [c for c in stated if c in common]
+        pairs = {n: self._renamed(names[0], n, common) for n in self.found if n not in names}
+        renamed = {name: own for name, own in pairs.items() if own}
+        for name in self.found.keys() - {*names, *renamed}:
+            lacking = [c for c in stated if c in common - self.found[name].keys()]
+            self._leave_out([name], f"{_OTHER}, without {join_names(lacking, 3)}")
+        trials = [TrialEntry(file=n, kind="free") for n in names]
+        trials += [TrialEntry(file=n, kind="free", columns=own) for n, own in renamed.items()]
+        return trials, [c for c in stated if c in common]
 
-    def _leave_out(
-        self, names: Collection[str], why: str = "other columns, for another session"
-    ) -> None:
+    def _renamed(self, first: str, other: str, common: frozenset[str]) -> dict[str, str]:
+        """Columns of another file by those of the first, where words of its own name are in theirs.
+
+        None unless it has all, with the same units.
+        """
+
+        def bare(file: str, columns: Collection[str]) -> dict[tuple[str, ...], str]:
+            own = {*re.findall(r"[a-z]+|\d+", file.rpartition(".")[0].lower())}
+            split = {c: re.findall(r"[^\W\d_]+|\d+|%", c.lower()) for c in columns}
+            return {tuple(w for w in said if w not in own): c for c, said in split.items()}
+
+        here, there = bare(first, common), bare(other, self.found[other])
+        if len(here) < len(common) or not here.keys() <= there.keys():
+            return {}
+        pairs = {column: there[key] for key, column in here.items()}
+        alike = all(self.found[first][x] == self.found[other][y] for x, y in pairs.items())
+        return pairs if alike else {}
+
+    def _leave_out(self, names: Collection[str], why: str = _OTHER) -> None:
         self.passed += [(name, why) for name in self.found if name in names]
         self.found = {name: own for name, own in self.found.items() if name not in names}
 
@@ -498,7 +533,11 @@ def _by_looks(
 
     InputError where no column has a name, and none looks like a position.
     """
-    unnamed = [c for c in columns if not c.role and not c.is_constant]
+    unnamed = [
+        c
+        for c in columns
+        if not c.is_constant and (not c.role or (c.role == "voltage" and not role_of(c.name, "")))
+    ]
     if any(c.role in ("position", "velocity") for c in columns) or not unnamed:
         return columns, []
     times = [c.values for c in columns if c.role == "time" and not c.is_constant]

@@ -503,7 +503,7 @@ def test_logs_with_their_time_come_first_and_unnamed_columns_are_alike_in_number
     write(tmp_path / "b/b.csv", "", Q[:20], U[:20])
     found = survey(tmp_path / "b")
     assert [trial.file for trial in found.trials] == ["a.csv"] and len(found.columns) == 3
-    assert found.passed == (("b.csv", "other columns, for another session"),)
+    assert found.passed == (("b.csv", "other columns, for another session, without column_3"),)
 
 
 def test_speeds_in_hertz_commands_and_one_reading_in_two_units(tmp_path):

@@ -134,9 +134,9 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     units = {h: u for h, u in units_in(header).items() if dialect.names or u in named}
     units |= _units_of_motion([line.text for line in lines[:index]], header)
     for line in lines[: max(index, 0)]:
-        key, *said = cells(line.text, delimiter) or [""]
-        if len(said) == len(header) - 1 and re.search(r"(?i)\bunits?:?\Z", key):
-            units = {h: u for h, u in zip(header[1:], said, strict=True) if u} | units
+        row = cells(line.text, delimiter)
+        if len(row) == len(header) and re.search(r"(?i)\bunits?:?\Z", row[0]):
+            units = {h: u for h, u in zip(header[1:], row[1:], strict=True) if u} | units
     remarks, scales = [], dict[str, float]()
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")

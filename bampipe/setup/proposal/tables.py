@@ -271,17 +271,17 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
             "the gear's data sheet; the torque goes with the angle as weight behind a gear does",
         )
     right, geared = column.si == axis.unit, axis.name in match.robot.gears
-    if (column.by_looks or column.is_foreign) and not right:
-        looks = f"which looks like the position of {axis.name}"
-        said = f"stated as '{column.stated}'" if column.is_foreign else looks
-        note = match.notes.ask("the unit of {}", UNITS, f"{column.name}, {said}")
-        return entry(column.name, UNKNOWN, _velocity_beside(axis, match)) + note
     if column.si == "V":
         return entry(column.name, UNKNOWN) + match.notes.ask(
             "the unit of {}, what one volt of it is, such as 47.7deg",
             "the sensor's certificate, or what it reads in two places that are known",
             column.name,
         )
+    if (column.by_looks or column.is_foreign) and not right:
+        looks = f"which looks like the position of {axis.name}"
+        said = f"stated as '{column.stated}'" if column.is_foreign else looks
+        note = match.notes.ask("the unit of {}", UNITS, f"{column.name}, {said}")
+        return entry(column.name, UNKNOWN, _velocity_beside(axis, match)) + note
     if not right and worth is not None:
         return entry(column.name, UNKNOWN) + match.notes.ask(
             f"the unit of {column.name}, which nothing states: by the weight on {axis.name},"
