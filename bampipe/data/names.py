@@ -10,24 +10,24 @@ from bampipe.data.units import unit
 DRIVERS = ("force", "current", "voltage")
 """Roles of what may drive an axis."""
 ROLE_WORDS = {
-    "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
-    " msec usec nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
+    "time": "t time utime timestamp stamp zeit clock timestep tout seconds sec secs nanosec"
+    " nsec nsecs msec usec nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
     " tid czas cas zaman aika ido ipoc timer",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
     " wanted con ctrl action ziel consigne consigna referencia riferimento planned requested",
     "brake": "brake bremse",
-    "acceleration": "acc accel acceleration qdd ddq beschleunigung aceleracion accelerazione",
-    "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate vitesse"
+    "acceleration": "acc accel acceleration qdd qacc ddq beschleunigung aceleracion accelerazione",
+    "velocity": "vel velocity speed qd dq qvel qdot omega geschwindigkeit drehzahl rpm rate vitesse"
     " velocidad velocidade velocita snelheid predkosc rychlost hiz hastighet",
     "force": "force forc f fx fy fz torque tau trq kraft moment drehmoment loadcell wrench effort"
     " eff couple fuerza forza forca par coppia momento koppel vridmoment tork kuvvet sila",
     "current": "current curr cur i iq amp amps ampere strom coil courant corriente corrente stroom",
     "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung tension"
     " voltaje tensao tensione",
-    "position": "pos position ang angle theta phi psi q enc encoder disp displacement dist x stroke"
-    " winkel weg lage hub joint deflection yaw pitch extension carriage counts pot poti"
-    " posicion posicao posizione angulo angolo hoek vinkel kat uhel aci konum poloha course"
-    " inkremente",
+    "position": "pos position qpos ang angle theta phi psi q enc encoder disp displacement dist x"
+    " stroke winkel weg lage hub deflection yaw pitch extension carriage counts pot"
+    " poti posicion posicao posizione angulo angolo hoek vinkel kat uhel aci konum poloha"
+    " course inkremente",
 }
 """Words for each role; of several roles with as good evidence, the first counts."""
 _SIGNS = {
@@ -73,6 +73,7 @@ _UNIT_WORDS = {
 }
 
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
+_ANGLES = frozenset(["ang", "angle", "theta", "phi", "psi"])
 _PRESENT = frozenset(["current", "curr", "cur"])
 _PHRASES = (
     (re.compile(r" load cell "), "force"),
@@ -137,8 +138,8 @@ def _evidence(name: str, stated: str) -> Iterator[tuple[str, float]]:
     for role, text in ROLE_WORDS.items():
         longest = max(map(len, own & {*text.split()}), default=0)
         roles |= {role} if longest else set()
-        first = role in ("reference", "brake")
         if longest:
+            first = role in ("reference", "brake")
             yield role, _OF_FIRST if first else _OF_WORD if longest > 1 else _OF_LETTER
     of_sensor = len(roles & {"position", "force"}) == 1  # whose volts stand for what it measures
     role = _role_by_unit(stated)
@@ -150,10 +151,12 @@ def _evidence(name: str, stated: str) -> Iterator[tuple[str, float]]:
     for letter in re.split(r"\W|_", name)[1:]:
         if letter in ("A", "V"):
             yield _role_by_unit(letter), _OF_LETTER + 0.5
+    if "joint" in own:
+        yield "position", _OF_HINT
     if "load" in own:
-        yield "force", _OF_HINT
+        yield "force", _OF_HINT + 0.5
     if name.startswith(lerobot.STATE):
-        yield "voltage" if "load" in name else "position", _OF_HINT + 0.5
+        yield "voltage" if "load" in name else "position", _OF_HINT + 0.7
 
 
 def _role_by_unit(text: str) -> str:
@@ -186,6 +189,8 @@ def unit_of(name: str, stated: str, role: str) -> str:
     inner = (part for part in parts[-2:0:-1] if len(part) > 1 and part in known)  # pos_mm_act
     for suffix in (*parts[1:][-1:], *inner):
         matches = [u for u in known if u.lower() == suffix.lower()]
+        if matches == ["m"] and _ANGLES & set(words(name)):
+            return ""  # theta_m is a motor's
         long = role not in ("", "time") and len(suffix) > _LONGEST_WORD
         if matches or (long and _role_by_unit(suffix) == role):
             return next(iter(matches), suffix)

@@ -226,7 +226,8 @@ class _Logs:
                 remedy=self.passed[0][1]
                 if self.passed
                 else f"supported file extensions are {', '.join(readers.EXTENSIONS)}"
-                + "; of XML, name it *.txt" * any(name.endswith(".xml") for name in others),
+                + "; of YAML, ros2 topic echo --csv makes a table"
+                * any(name.endswith((".yaml", ".yml")) for name in others),
             )
         if len(paths) > MOST_FILES:
             raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
@@ -450,8 +451,8 @@ class _Logs:
         for column in ordered:
             said = raw.units.get(column, labels[column])
             role = role_of(column, said)
-            if role and clock.column != column and re.search(r":column_\d+$", column):
-                # Of files without a header, named for what the rest of their columns is.
+            if role and clock.column != column and re.search(r":column_\d+$|\[0\]$", column):
+                # Of files without a header or a matrix, named for what the rest of it is.
                 role = "time" if is_time(raw.columns[column][sound]) else role
             unit = unit_of(column, said, role)
             factor = FACTOR.search(column)

@@ -54,7 +54,7 @@ _SPELLINGS = {
     "millimeter": "mm", "millimetre": "mm", "centimeter": "cm", "inch": "in", "inche": "in",
     "foot": "ft", "feet": "ft", "lb": "lbf", "pound": "lbf", "oz": "ozf", "hz": "Hz",
     "percent": "%", "pct": "%", "Arms": "A", "Vdc": "V", "Vrms": "V", "U": "rev", "Umdr": "rev",
-    "tr": "rev", "grado": "deg", "grados": "deg", "grader": "deg", "derece": "deg", "degré": "deg",
+    "tr": "rev", "grado": "deg", "gradi": "deg", "grader": "deg", "derece": "deg", "degré": "deg",
 }  # fmt: skip
 """Of single factors; those in the plural are found without their s."""
 _PLAIN = str.maketrans("µμ×⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "uux-0123456789")

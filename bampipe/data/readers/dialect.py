@@ -310,8 +310,16 @@ def _trimmed(row: list[str], width: int) -> list[str]:
 def _otherwise(text: str, width: int) -> list[list[str]]:
     """The names in a header of ``width`` cells, by each delimiter that separates so many."""
     plain = _REMARK.sub("", text, count=1).strip()
-    split = [cells(plain, delimiter) for delimiter in DELIMITERS] + [re.split(r"\s{2,}", plain)]
+    split = [cells(plain, delimiter) for delimiter in DELIMITERS]
+    split += [re.split(r"\s{2,}", plain), re.split(r"\s+(?![\[(])", plain)]
+    split += [[item for name in plain.split() for item in _counted(name)]]
     return [row for row in split if len(row) == width > 1]
+
+
+def _counted(name: str) -> list[str]:
+    """The names of as many columns as a name says behind it: ``q[2]`` is q[0] and q[1]."""
+    match = re.fullmatch(r"(\S+)\[(\d{1,2})\]", name)
+    return [f"{match[1]}[{k}]" for k in range(int(match[2]))] if match else [name]
 
 
 def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> list[str]:
@@ -464,7 +472,8 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
         row = cells(lines[n].text, delimiter)
         if len(row) != width:
             break
-        if _is_key_of_names(row):
+        alone = row[0].lower() in _NAME_KEYS and not cells(lines[first].text, delimiter)[0]
+        if alone or _is_key_of_names(row):
             return n
     wordy = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
     if wordy and wordy[-1] != fitting[-1]:
@@ -546,7 +555,7 @@ def _of_properties(row: list[str]) -> tuple[list[str], bool]:
     if len(keys) >= 0.5 * len(said) > 0:
         return [re.sub(r"^[A-Za-z ]+:\s+", "", cell) for cell in row], True
     key = row[0] if row else ""
-    listed = re.match(r"[A-Za-z]{3}", key) is not None and key.lower() not in ("sec", "rad", "deg")
+    listed = re.match(r"[^\W\d_]{3}", key) is not None and key.lower() not in ("sec", "rad", "deg")
     alone = row.count(key) > 1 or unit(key) is None
     if not (listed and alone):
         return row, False

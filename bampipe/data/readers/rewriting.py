@@ -50,6 +50,11 @@ _FOREIGN = (
     (re.compile(r"\s*(\(\S+\)\s+)?\w+\s+[0-9A-F]{3,8}\s+\[\d+\]\s"), _CAN, _DECODE),
     (re.compile(r"\s*\d+\.\d+\s+\d+\s+[0-9A-Fa-f]+x?\s+[RT]x\s+d "), _CAN, _DECODE),
     (
+        re.compile(r"header:\s*\Z"),
+        "messages of ROS one below the other",
+        "record a bag, or write a line a message: ros2 topic echo --csv, rostopic echo -p",
+    ),
+    (
         re.compile(r"# name: \w+"),
         "variables one below the other, as Octave writes them",
         "save them with: save -v7 FILE.mat",
@@ -118,6 +123,8 @@ def find_form(head: str) -> Form | None:
     ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
     if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
         return Form("", lambda line: line.removesuffix(";"))
+    if re.fullmatch(r"[^\[]*\]\s*;?\s*", lines[-1]):  # of a matrix of MATLAB
+        return Form("", lambda line: re.sub(r"^\s*\[|[\s;]*\]?[\s;]*$", "", line))
     if _are(_STAMPED, lines):
         return _stamped(lines)
     for kind, form in _ALIKE.items():

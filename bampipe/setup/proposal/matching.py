@@ -15,8 +15,8 @@ from bampipe.setup.proposal.positions import is_of_motor, travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
 _NO_LESS = 0.03
-_SUPPLIED = frozenset(["in", "input", "supply", "bus", "battery"])
-"""Words in the name of what a converter takes up rather than what its motor gets."""
+_SUPPLIED = frozenset(["in", "input", "supply", "bus", "battery", "d", "id"])
+"""Words in the name of what a converter takes up, or of flux, rather than what turns a motor."""
 _NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
 Match = tuple[SurveyedColumn | None, str]

@@ -59,7 +59,9 @@ def slides(column: SurveyedColumn, found: Survey) -> bool:
     """Whether an axis slides rather than turns: by its unit, its name, or a force in newtons."""
     if column.si:
         return column.si in ("m", "m/s")
-    return bool(set(words(column.name)) & SLIDING) or any(f.si == "N" for f in found.of("force"))
+    said, forces = set(words(column.name)), found.of("force")
+    along = bool(said & {"x", "y", "z"}) and any(is_force(f) for f in forces)
+    return along or bool(said & SLIDING) or any(f.si == "N" for f in forces)
 
 
 def travelled(column: SurveyedColumn, t: np.ndarray) -> np.ndarray:
