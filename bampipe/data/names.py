@@ -1,59 +1,24 @@
 """What the name of a column says of it: its words, its unit, and what it is."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from unicodedata import combining, normalize
 
 from bampipe.data.readers import lerobot
 from bampipe.data.units import unit
+from bampipe.data.vocabulary import VOCABULARY, word_set
 
 DRIVERS = ("force", "current", "voltage")
 """Roles of what may drive an axis."""
-ROLE_WORDS = {
-    "time": "t time utime timestamp stamp zeit clock timestep tout seconds sec secs nanosec"
-    " nsec nsecs msec usec nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
-    " tid czas cas zaman aika ido ipoc timer",
-    "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
-    " wanted con ctrl action ziel consigne consigna referencia riferimento planned requested",
-    "brake": "brake bremse",
-    "acceleration": "acc accel acceleration qdd qacc ddq beschleunigung aceleracion accelerazione",
-    "velocity": "vel velocity speed qd dq qvel qdot omega geschwindigkeit drehzahl rpm rate vitesse"
-    " velocidad velocidade velocita snelheid predkosc rychlost hiz hastighet",
-    "force": "force forc f fx fy fz torque tau trq kraft moment drehmoment loadcell wrench effort"
-    " eff couple fuerza forza forca par coppia momento koppel vridmoment tork kuvvet sila",
-    "current": "current curr cur i iq amp amps ampere strom coil courant corriente corrente stroom",
-    "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung tension"
-    " voltaje tensao tensione",
-    "position": "pos position qpos ang angle theta phi psi q enc encoder disp displacement dist x"
-    " stroke winkel weg lage hub deflection yaw pitch extension carriage counts pot"
-    " poti posicion posicao posizione angulo angolo hoek vinkel kat uhel aci konum poloha"
-    " course inkremente",
-}
-"""Words for each role; of several roles with as good evidence, the first counts."""
-_SIGNS = {
-    "加速度": "acc", "速度": "velocity", "力矩": "torque", "扭矩": "torque", "转矩": "torque",
-    "トルク": "torque", "时间": "time", "時間": "time", "角度": "angle", "位置": "position",
-    "位移": "displacement", "电流": "current", "電流": "current", "电压": "voltage",
-    "電圧": "voltage",
-    "目标": "target", "目標": "target", "期望": "desired", "指令": "command", "力": "force",
-    "время": "time", "угол": "angle", "скорость": "velocity", "момент": "torque", "ток": "current",
-}  # fmt: skip
-"""Words of other scripts; of those inside others the longer comes first."""
+ROLE_WORDS: Mapping[str, str] = VOCABULARY["roles"]
 _PLAIN = str.maketrans({"ı": "i", "ł": "l", "Ł": "L", "ø": "o", "ß": "ss", "µ": "u", "μ": "u"})
 _ALL_WORDS = frozenset(word for text in ROLE_WORDS.values() for word in text.split())
 _ENDS = sorted((word for word in _ALL_WORDS if len(word) > 4 or word in ("time", "zeit")), key=len)
 _RUN_TOGETHER = re.compile(r"(q|dq|tau|trq|pos|vel)(des|ref|cmd|meas|msr|act)")
 REFERENCE_WORDS = frozenset(ROLE_WORDS["reference"].split())
 """Words for what a controller asks for rather than what was measured."""
-_GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
-"""Words in the name of a column that say less of it than the name of its file."""
-_BY_UNIT = {
-    "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
-    "m/s": "velocity", "kg": "force", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
-}  # fmt: skip
-_SHORT_UNITS = frozenset(["mm", "Nm", "kN", "gf", "mA", "mV"])
-_LONG_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano", "meter"])
-"""Units of two letters at the end of a name that are no words, and longer ones that are."""
+_BY_UNIT: Mapping[str, str] = VOCABULARY["roles_by_unit"]
+_VAGUE, _TERSE, _WORDY = map(word_set, ("vague", "terse", "wordy"))
 _VELOCITY_UNIT = re.compile(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$")
 """Unit of a velocity at the end of a name."""
 _LONGEST_WORD = 2
@@ -63,23 +28,10 @@ FACTOR = re.compile(
     r"(?:1?e\d|10+|\d{3,})(?![a-z\d.])"
 )
 """In a name, what its unit is multiplied by, or its numbers are."""
-_UNIT_WORDS = {
-    "time": ("us", "ms", "ns", "s", "min"),
-    "position": ("mrad", "rad", "deg", "°", "mm", "cm", "um", "nm", "m"),
-    "velocity": ("rad/s", "deg/s", "mm/s", "m/s", "rpm"),
-    "force": ("mNm", "Ncm", "Nmm", "Nm", "kN", "cN", "mN", "N", "V", "kp", "kg", "g", "gf", "%"),
-    "current": ("mA", "A"),
-    "voltage": ("mV", "V", "percent", "pct", "%"),
-}
-
+_UNIT_WORDS = {role: text.split() for role, text in VOCABULARY["units_in_names"].items()}
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _ANGLES = frozenset(["ang", "angle", "theta", "phi", "psi"])
 _PRESENT = frozenset(["current", "curr", "cur"])
-_PHRASES = (
-    (re.compile(r" load cell "), "force"),
-    (re.compile(r" i q "), "current"),
-)
-"""Words that together say what a column is."""
 _OF_FIRST, _OF_UNIT, _OF_WORD, _OF_SUFFIX, _OF_LETTER, _OF_HINT = 6, 5, 4, 3, 2, 1
 """Weights of what tells the role of a column, from words for what is asked for to mere hints."""
 
@@ -87,7 +39,7 @@ _OF_FIRST, _OF_UNIT, _OF_WORD, _OF_SUFFIX, _OF_LETTER, _OF_HINT = 6, 5, 4, 3, 2,
 def words(name: str) -> list[str]:
     """The words in the name of a column, in lower case and without accents; of compounds, each."""
     bare = re.sub(r"[\[(（].*?[\])）]", " ", name)
-    for foreign, english in _SIGNS.items():
+    for foreign, english in VOCABULARY["other_scripts"].items():
         bare = bare.lower().replace(foreign, f" {english} ") if foreign in bare.lower() else bare
     bare = "".join(c for c in normalize("NFKD", bare.translate(_PLAIN)) if not combining(c))
     parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare))
@@ -111,7 +63,7 @@ def role_of(name: str, stated: str) -> str:
     part, colon, bare = name.partition(":")
     if colon and not part.startswith("/"):
         alone = role_of(bare, stated)
-        vague = set(words(bare)) <= _GENERAL or not alone
+        vague = set(words(bare)) <= _VAGUE or not alone
         return (vague and role_of(part, "")) or alone
     weights: dict[str, float] = {}
     for role, weight in _evidence(name, stated):
@@ -128,8 +80,8 @@ def _evidence(name: str, stated: str) -> Iterator[tuple[str, float]]:
     clock = plain.lower() in _UNIT_WORDS["time"] or plain.lower().startswith("x_value")
     if stated == "datetime" or clock or plain.rpartition(".")[2] == "ts":  # Ts: rather an interval
         yield "time", _OF_FIRST + 1
-    for phrase, role in _PHRASES:
-        if phrase.search(f" {' '.join(said)} "):
+    for phrase, role in VOCABULARY["phrases"].items():
+        if f" {phrase} " in f" {' '.join(said)} ":
             yield role, _OF_FIRST + 1
     own = {*said, *(w.removesuffix(end) for w in said for end in ("s", "ed") if len(w) > 3)}
     if own & _PLAIN_POSITIONS:
@@ -169,8 +121,8 @@ def _role_by_suffix(name: str) -> str:
     if _VELOCITY_UNIT.search(name):
         return "velocity"
     suffix = re.split(r"[_\W]+", name)[-1]
-    long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _LONG_WORDS
-    role = _role_by_unit(suffix) if long or suffix in _SHORT_UNITS else ""
+    long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _WORDY
+    role = _role_by_unit(suffix) if long or suffix in _TERSE else ""
     return role if role != "time" else ""
 
 
@@ -185,7 +137,7 @@ def unit_of(name: str, stated: str, role: str) -> str:
     both = ".".join(parts[-2:]) if role == "force" and len(parts) > 2 else ""  # in_lbs, not in_N
     if re.match("in.(lb|oz)|(?!in.)", both.lower()) and (arm := unit(both)) and arm.si == "N.m":
         return both
-    known = _UNIT_WORDS.get(role, ())
+    known = _UNIT_WORDS.get(role, [])
     inner = (part for part in parts[-2:0:-1] if len(part) > 1 and part in known)  # pos_mm_act
     for suffix in (*parts[1:][-1:], *inner):
         matches = [u for u in known if u.lower() == suffix.lower()]

@@ -13,18 +13,8 @@ from bampipe.data.units import unit
 
 _SMALL = 1 << 16
 """Bytes of what is written about logs, the most."""
-_NOTES = (
-    ".json",
-    ".yaml",
-    ".yml",
-    ".toml",
-    ".ini",
-    ".cfg",
-    ".txt",
-    ".md",
-    ".hdr",
-    ".info",
-    ".meta",
+_NOTES = frozenset(
+    [".json", ".yaml", ".yml", ".toml", ".ini", ".cfg", ".txt", ".md", ".hdr", ".info", ".meta"]
 )
 """File extensions of what is written about logs."""
 _STATEMENT = re.compile(

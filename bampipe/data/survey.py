@@ -29,24 +29,15 @@ from bampipe.data.session.channels import CLOCK_UNITS
 from bampipe.data.session.file import lexically_inside
 from bampipe.data.stated_rate import intervals_stated, units_stated
 from bampipe.data.units import RecordedUnit, spelled, unit
+from bampipe.data.vocabulary import by_word, word_set
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 
 MOST_FILES = 500
 _MOST_COLUMNS = 500
 """Of a table of samples, unless it has many rows."""
-_OTHER_DATA = {
-    **dict.fromkeys((".xls", ".ods"), "save the sheet as .xlsx or CSV"),
-    **dict.fromkeys((".db", ".sqlite", ".sqlite3"), "export its table as CSV"),
-    **dict.fromkeys((".pkl", ".pickle", ".joblib"), "it may run any program; save with np.savez"),
-    **dict.fromkeys((".orc", ".rds"), "save it as Parquet or CSV"),
-    **dict.fromkeys((".zip", ".gz", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
-    **dict.fromkeys(
-        (".c3d", ".mf4", ".mdf", ".blf", ".bin", ".ulg", ".tlog", ".trc", ".r64", ".fig", ".slx"),
-        "export its channels as CSV, a sample a row",
-    ),
-}
-"""Files of data that are not read, and what to do."""
+_OTHER_DATA = by_word("unreadable")
+"""What to do with files of data that are not read."""
 _SMALL = 1 << 16
 """Bytes below which a text may be no log but a line of results."""
 _MOST_SCANNED = 1 << 30
@@ -56,16 +47,10 @@ _WHOLE = 2
 """Of logs that hold both a motion and what drives it."""
 _RISES = 0.8
 """Share of samples at which a clock rises, if what else it does is an accident."""
-_ASKED = frozenset(
-    ["desired", "des", "reference", "ref", "setpoint", "target", "planned", "sim", "simulated"]
-)
-_TWINS = _ASKED | {"measured", "meas", "actual", "act", "real", "feedback"}
+_ASKED = word_set("asked")
+_TWINS = _ASKED | word_set("measured")
 """Words in the name of a file of what was asked for, and in that of the measurement beside it."""
-_JOINED = {
-    "rows": "row by row",
-    "time": "by their times",
-    "start": "by their times, as if begun together",
-}
+_JOINED = {"rows": "row by row", "time": "by their times", "start": "as if begun together"}
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from bampipe.data.readers.dialect import cells
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER
 from bampipe.data.units import unit
+from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError
 
 _PAIR = re.compile(rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*({NUMBER})(?![\w.:])""")
@@ -37,38 +38,6 @@ PUT_BEFORE = "export with the minus before the number, not behind it and not as 
 _GROUPS = ((",", r"\."), (".", ","), (" ", "[.,]"), ("'", "[.,]"), ("’", "[.,]"))
 """Signs between thousands, and what may stand before the decimals then."""
 _BROKEN = re.compile(r'(?<![^\n,;\t])"[^",;\t\r\n]*(?:[\r\n]+[^",;\t\r\n]*){1,3}"(?![^\r\n,;\t])')
-_BYTE = "[,;\t](0x)?[0-9A-Fa-f]{2}"
-_CAN = "frames of a CAN bus, whose bytes mean nothing without their data base (DBC)"
-_DECODE = "decode them, for example with `cantools`, `asammdf` or the logger, to a CSV of signals"
-_PIVOT = (
-    "make it a column a signal: frame.pivot(index=TIME, columns=SIGNAL, values=VALUE) in pandas,"
-    ' |> pivot(rowKey: ["_time"], columnKey: ["_field"], valueColumn: "_value") in Flux'
-)
-_FOREIGN = (
-    (re.compile(rf"\d+\.\d+[,;\t]\w+[,;\t][1-8](?=.*[A-Fa-f])({_BYTE}){{1,8}}\Z"), _CAN, _DECODE),
-    (re.compile(r"\s*\(\d+\.\d+\)\s+\w+\s+[0-9A-F]+#"), _CAN, _DECODE),
-    (re.compile(r"\s*(\(\S+\)\s+)?\w+\s+[0-9A-F]{3,8}\s+\[\d+\]\s"), _CAN, _DECODE),
-    (re.compile(r"\s*\d+\.\d+\s+\d+\s+[0-9A-Fa-f]+x?\s+[RT]x\s+d "), _CAN, _DECODE),
-    (
-        re.compile(r"header:\s*\Z"),
-        "messages of ROS one below the other",
-        "record a bag, or write a line a message: ros2 topic echo --csv, rostopic echo -p",
-    ),
-    (
-        re.compile(r"# name: \w+"),
-        "variables one below the other, as Octave writes them",
-        "save them with: save -v7 FILE.mat",
-    ),
-    (
-        re.compile(
-            r"(?i)(?=.*\b_?(?:field|variable|signal|channel|parameter|series|metric|sensor|tag)\b)"
-            r"(?=.*\b_?value\b)"
-        ),
-        "a reading a row, one signal below the other",
-        _PIVOT,
-    ),
-)
-"""Lines of texts that are no table of samples, what they are, and what to do."""
 _TYPESET = {"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2009": " "}
 """Minus and blanks of typesetters."""
 _MOST = 0.8
@@ -148,9 +117,9 @@ def find_form(head: str) -> Form | None:
         if found:
             return found
     for line in (*whole[:_FEWEST], lines[-1]):
-        for pattern, what, remedy in _FOREIGN:
-            if pattern.match(line):
-                raise InputError(what, remedy=remedy)
+        for kind in VOCABULARY["no_tables"]:
+            if any(re.match(pattern, line) for pattern in kind["lines"]):
+                raise InputError(kind["what"], remedy=kind["remedy"])
     return None
 
 

@@ -10,19 +10,13 @@ from bampipe.data.guesses import Driven
 from bampipe.data.names import REFERENCE_WORDS, words
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit as unit_named
+from bampipe.data.vocabulary import word_set
 from bampipe.physics.device import KINDS
 from bampipe.physics.expression import FUNCTIONS
 from bampipe.setup.hypotheses import MOST_TRAVEL
 from bampipe.setup.proposal.positions import in_counts
 
-_NAMELESS = (
-    "enc encoder pos position angle counts ticks displacement disp stroke present actual act"
-    " measured meas current state value deg degree degrees rad radian radians vel velocity speed"
-    " header feedback column ang motion dist percent rec log data mot motor field run runs"
-    " observation ist akt grad rev mesure mesuree medido misurato gemessen trial experiment"
-    " inertia offset moment inkremente increments samples channels signals"
-)
-"""Words in the name of a position that name no axis."""
+_NAMELESS = word_set("nameless")
 _FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "eff", "torque", "tau"}
 _DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
 _PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
@@ -141,7 +135,7 @@ def starter_device(
         weight: gravity on the axis, None where it carries none.
         sign_width: of the sign of the velocity, rad/s or m/s; 0 for the usual one.
     """
-    taken = {*_NAMELESS.split(), *FUNCTIONS}
+    taken = {*_NAMELESS, *FUNCTIONS}
     item = re.search(r"\[([A-Za-z]\w*)\]", position)  # of a list, such as position[elbow]
     parts = [item[1]] if item and unit_named(item[1]) is None else []
     names = [w for p in (*parts, position) for w in words(p) if w not in taken and len(w) > 2]
