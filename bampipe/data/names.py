@@ -28,7 +28,9 @@ FACTOR = re.compile(
     r"(?:1?e\d|10+|\d{3,})(?![a-z\d.])"
 )
 """In a name, what its unit is multiplied by, or its numbers are."""
-_UNIT_WORDS = {role: text.split() for role, text in VOCABULARY["units_in_names"].items()}
+_UNIT_WORDS: Mapping[str, list[str]] = {
+    role: text.split() for role, text in VOCABULARY["units_in_names"].items()
+}
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _ANGLES = frozenset(["ang", "angle", "theta", "phi", "psi"])
 _PRESENT = frozenset(["current", "curr", "cur"])

@@ -275,40 +275,38 @@ def _at_one_rate(arrays: Arrays) -> Arrays:
 
     Of groups that each have a time, and one signal or others than the rest; else they are trials.
     """
-    groups: dict[str, dict[str, str]] = {}
+    groups: dict[str, dict[str, Stored]] = {}
     for name, array in arrays.items():
         owner, dot, key = name.rpartition("/" if "/" in name else ".")
-        sampled = array.kind in _NUMBERS and labels("", array.shape) and math.prod(array.shape) > 1
+        sampled = array.kind in _NUMBERS and max(array.shape, default=1) > 1
         if dot and sampled and not _RUN.fullmatch(name):
-            groups.setdefault(owner, {})[key] = name
-    timed: dict[str, list[str]] = {}
-    kinds = []
-    for own in groups.values():
-        if clock := next((name for key, name in own.items() if _CLOCK.match(key)), ""):
-            shape = arrays[clock].shape
-            timed[clock] = [
-                x for x in own.values() if arrays[x].shape[:1] == shape[:1] and x != clock
-            ]
-            kinds.append(frozenset(own))
-    several = len(timed) > 1 and (len({*kinds}) == len(kinds) or {*map(len, timed.values())} == {1})
-    longest = max(timed, key=lambda clock: arrays[clock].shape, default="")
+            groups.setdefault(owner + dot, {})[key] = array
+    clocks = {
+        own: key for own, keys in groups.items() if (key := next(filter(_CLOCK.match, keys), ""))
+    }
+    kinds = [frozenset(groups[own]) for own in clocks]
+    if len(clocks) < 2 or (len({*kinds}) < len(kinds) and max(map(len, kinds)) > 2):
+        return arrays
+    longest = max(
+        (groups[own][key] for own, key in clocks.items()), key=lambda x: math.prod(x.shape)
+    )
     found = dict(arrays)
-    for clock, names in timed.items() if several else ():
-        if arrays[clock].shape == arrays[longest].shape or not names:
-            continue
-        del found[clock]
-        for name in names:
-            shape = (*arrays[longest].shape[:1], *arrays[name].shape[1:])
-            load = partial(_resampled, *(arrays[x] for x in (longest, clock, name)))
-            found[name] = replace(arrays[name], shape=shape, load=load)
+    for own, key in clocks.items():
+        times = groups[own].pop(key)
+        if times.shape != longest.shape and groups[own]:
+            del found[own + key]
+            for name, array in groups[own].items():
+                width = array.shape[1:] if array.shape != times.shape else longest.shape[1:]
+                load = partial(_resampled, longest, times, array)
+                shape = (*longest.shape[:1], *width)
+                found[own + name] = replace(array, shape=shape, load=load)
     return found
 
 
 def _resampled(at: Stored, times: Stored, values: Stored) -> np.ndarray:
-    t, own = at.load().astype(float).ravel(), times.load().astype(float).ravel()
-    table = values.load().astype(float)
-    columns = [interpolated(t, own, column) for column in table.reshape(len(own), -1).T]
-    return np.column_stack(columns).reshape(len(t), *table.shape[1:])
+    t, own, table = (array.load().astype(float) for array in (at, times, values))
+    columns = table.reshape(own.size, -1).T
+    return np.column_stack([interpolated(t.ravel(), own.ravel(), column) for column in columns])
 
 
 def _join_runs(arrays: Arrays) -> tuple[dict[str, Stored], dict[str, tuple[int, ...]]]:

@@ -233,10 +233,7 @@ def _check_robot(
         )
     if UNKNOWN_CONSTANT not in chosen.text:
         return chosen
-    note = notes.ask(
-        f"torque_constant of each motor in {chosen.name}, N.m/A at the joint",
-        "the drive's data sheet, times the reduction",
-    )
+    note = notes.ask("torque_constants", device=chosen.name)
     return replace(chosen, text=chosen.text.replace(UNKNOWN_CONSTANT, f'= "{UNKNOWN}"{note}'))
 
 
@@ -300,8 +297,7 @@ def _trial_kind(file: str, device: Device, notes: Notes) -> list[str]:
     if "viscous" in said:
         return [
             'kind = "viscous"' + notes.guess(f"{file} is a viscous trial, by its name"),
-            "viscous_n_s_per_m = 0.0"
-            + notes.ask("viscous_n_s_per_m, the damping", "the commands of the brakes' controller"),
+            "viscous_n_s_per_m = 0.0" + notes.ask("viscous"),
         ]
     return ['kind = "free"']
 

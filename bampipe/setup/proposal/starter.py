@@ -31,11 +31,7 @@ _SOURCES = {
 }
 """Constants that only their user knows: value to start from, unit, and where to look them up."""
 
-_ANGLES = frozenset(
-    ["angle", "theta", "phi", "psi", "winkel", "joint", "rotation", "deg", "rad", "degrees"]
-)
-_UPRIGHT = frozenset(["yaw", "pan", "azimuth", "heading"])
-"""What an axis that stands upright, and carries no weight, is called."""
+_ANGLES, _UPRIGHT = map(word_set, ("turning", "upright"))
 _DOUBTS: dict[Reading, str] = {
     "either": "a torque follows the angle, and over so short a travel a spring's looks alike",
     "both": "a torque follows the angle, and neither weight nor a spring alone explains it; what is"
