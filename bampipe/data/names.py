@@ -10,12 +10,12 @@ from bampipe.data.vocabulary import VOCABULARY, word_set
 
 DRIVERS = ("force", "current", "voltage")
 """Roles of what may drive an axis."""
-ROLE_WORDS: Mapping[str, str] = VOCABULARY["roles"]
+_ROLE_WORDS: Mapping[str, str] = VOCABULARY["roles"]
 _PLAIN = str.maketrans({"ı": "i", "ł": "l", "Ł": "L", "ø": "o", "ß": "ss", "µ": "u", "μ": "u"})
-_ALL_WORDS = frozenset(word for text in ROLE_WORDS.values() for word in text.split())
+_ALL_WORDS = frozenset(word for text in _ROLE_WORDS.values() for word in text.split())
 _ENDS = sorted((word for word in _ALL_WORDS if len(word) > 4 or word in ("time", "zeit")), key=len)
 _RUN_TOGETHER = re.compile(r"(q|dq|tau|trq|pos|vel)(des|ref|cmd|meas|msr|act)")
-REFERENCE_WORDS = frozenset(ROLE_WORDS["reference"].split())
+REFERENCE_WORDS = frozenset(_ROLE_WORDS["reference"].split())
 """Words for what a controller asks for rather than what was measured."""
 _BY_UNIT: Mapping[str, str] = VOCABULARY["roles_by_unit"]
 _VAGUE, _TERSE, _WORDY = map(word_set, ("vague", "terse", "wordy"))
@@ -73,7 +73,7 @@ def role_of(name: str, stated: str) -> str:
     best = [role for role in weights if weights[role] == max(weights.values())]
     if len(best) > 1 and weights[best[0]] <= _OF_LETTER:
         return ""  # x_F: letters that stand for several quantities
-    return min(best, key=[*ROLE_WORDS, ""].index, default="")
+    return min(best, key=[*_ROLE_WORDS, ""].index, default="")
 
 
 def _evidence(name: str, stated: str) -> Iterator[tuple[str, float]]:
@@ -89,7 +89,7 @@ def _evidence(name: str, stated: str) -> Iterator[tuple[str, float]]:
     if own & _PLAIN_POSITIONS:
         own -= _PRESENT  # the position that is current, and no current
     roles = set()
-    for role, text in ROLE_WORDS.items():
+    for role, text in _ROLE_WORDS.items():
         longest = max(map(len, own & {*text.split()}), default=0)
         roles |= {role} if longest else set()
         if longest:

@@ -11,15 +11,7 @@ import numpy as np
 
 from bampipe.data import readers
 from bampipe.data.guesses import MOST_IN_TURN, describe, find_roles, is_time, take_turns
-from bampipe.data.names import (
-    DRIVERS,
-    FACTOR,
-    REFERENCE_WORDS,
-    ROLE_WORDS,
-    role_of,
-    unit_of,
-    words,
-)
+from bampipe.data.names import DRIVERS, FACTOR, REFERENCE_WORDS, role_of, unit_of, words
 from bampipe.data.parts import axes_of, join_parts
 from bampipe.data.readers import columns_of, extension_of, is_log, is_text, lerobot, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
@@ -562,9 +554,8 @@ def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
     wanted = ("current",) if measured == ["force"] else () if measured else DRIVERS
     found = []
     for column in columns:
-        said = set(words(column.name)) - REFERENCE_WORDS
-        named = (role for role in DRIVERS if said & set(ROLE_WORDS[role].split()))
-        role = role_of("", column.stated) or next(named, "")
+        bare = "_".join(word for word in words(column.name) if word not in REFERENCE_WORDS)
+        role = role_of(bare, column.stated)
         commands = column.role == "reference" and role in wanted
         found.append(replace(column, role=role) if commands else column)
     return tuple(found)

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from pyarrow import dataset
 
 from bampipe.data.readers import lerobot, moments
-from bampipe.data.readers.arrays import LARGEST_WIDTH, ArrayReader, Opened, Stored
+from bampipe.data.readers.arrays import ArrayReader, Opened, Stored
 from bampipe.data.readers.nested import leaves
 from bampipe.data.readers.trial import NUMBER, RawTrial, Wanted
 from bampipe.data.units import SCALES, in_steps, units_beside
@@ -58,18 +58,17 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         if size := [float(text) for text in sizes if re.fullmatch(NUMBER, text)]:
             said = in_steps(load(), size, said)
         found[field.name] = Stored((rows,), kind, load, said)
-    vectors, long = lerobot.vector_columns(path, schema), set[str]()
+    vectors = lerobot.vector_columns(path, schema)
     for name, (vector, place) in vectors.items():
-        if place >= LARGEST_WIDTH:
-            long.add(vector)
         found[name] = Stored((rows,), "f", partial(_cells, read_column, vector, place))
-    for name in sorted(long) if rows <= _MOST_TRIALS else ():  # a trial a row
-        sizes = pc.list_value_length(read_column(name)).to_pylist()
-        for k, size in enumerate(sizes):
-            found[f"trial{k}.{name}"] = Stored(
-                (size,), "f", partial(_cells, read_column, name, row=k)
-            )
-    found = {name: held for name, held in found.items() if vectors.get(name, ("",))[0] not in long}
+    taken = {vector for vector, _ in vectors.values()}
+    for field in schema if rows <= _MOST_TRIALS else ():  # a trial a row
+        numbers = pa.types.is_list(field.type) and _KINDS["f"][:2]
+        if numbers and field.name not in taken and any(x(field.type.value_type) for x in numbers):
+            cells = read_column(field.name).cast(pa.list_(pa.float64()))
+            for k, size in enumerate(pc.list_value_length(cells).to_pylist()):
+                load = partial(_values_of_row, cells, k)
+                found[f"trial{k}.{field.name}"] = Stored((size,), "f", load)
     yield found, ()
 
 
@@ -88,16 +87,15 @@ def columns(path: Path) -> dict[str, str]:
     return {name: unit for name, unit in found.items() if name not in numbers}
 
 
+def _values_of_row(cells: pa.ChunkedArray, row: int) -> np.ndarray:
+    return np.asarray(cells[row].values.to_numpy(zero_copy_only=False))
+
+
 def _cells(
-    read_column: Callable[[str], pa.ChunkedArray],
-    name: str,
-    place: int | None = None,
-    row: int | None = None,
+    read_column: Callable[[str], pa.ChunkedArray], name: str, place: int | None = None
 ) -> np.ndarray:
-    """A column, or an element of its vectors, or that of a row, (T,): numbers, moments or texts."""
+    """A column, or an element of its vectors, (T,): numbers, moments or texts."""
     cells = read_column(name)
-    if row is not None:
-        return np.asarray(cells[row].values.to_numpy(zero_copy_only=False))
     if place is not None:
         cells = pc.list_element(cells, place)
     if pa.types.is_timestamp(cells.type) or pa.types.is_date(cells.type):

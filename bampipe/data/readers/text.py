@@ -62,8 +62,7 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
 
 def columns(path: Path, dialect: Dialect | None = None) -> dict[str, str]:
     """Names and units of the columns of numbers, or of moments (unit "datetime")."""
-    with _opened(path, dialect or Dialect()) as (stream, dialect, _):
-        head = _head(stream)
+    head, dialect = _rewritten_head(path, dialect or Dialect())
     if dialects.share_of_rows(head) < _LEAST_ROWS:
         return {}
     layout = dialects.find_layout(head, (), dialect)
@@ -79,8 +78,7 @@ def above_samples(path: Path) -> str:
     Raises:
         InputError: it is none.
     """
-    with _opened(path, Dialect()) as (stream, dialect, _):
-        head = _head(stream)
+    head, dialect = _rewritten_head(path, Dialect())
     if dialects.share_of_rows(head) < _LEAST_ROWS:
         raise InputError("not a table")
     start = dialects.find_layout(head, (), dialect).start
@@ -92,10 +90,14 @@ def is_table(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             _head(file)
-        with _opened(path, Dialect()) as (stream, _, _):
-            return dialects.share_of_rows(_head(stream)) > _MANY_ROWS
+        return dialects.share_of_rows(_rewritten_head(path, Dialect())[0]) > _MANY_ROWS
     except (OSError, InputError):
         return False
+
+
+def _rewritten_head(path: Path, dialect: Dialect) -> tuple[bytes, Dialect]:
+    with _opened(path, dialect) as (stream, dialect, _):
+        return _head(stream), dialect
 
 
 @contextmanager

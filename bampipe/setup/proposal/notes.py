@@ -9,8 +9,13 @@ from bampipe.lists import join_names
 
 UNKNOWN = "?"
 """Stands for a column that could not be found."""
-_FILE = Path(__file__).with_name("questions.toml")
-_QUESTIONS = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+_FILE = Path(__file__).with_name("sentences.toml")
+_SENTENCES = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+
+
+def sentence(name: str, **known: object) -> str:
+    """A sentence of ``sentences.toml`` on what was guessed, with the fields in it."""
+    return str(_SENTENCES["said"][name].format(**known))
 
 
 @dataclass
@@ -47,11 +52,11 @@ class Notes:
         """The comment that marks what a person must fill in.
 
         Args:
-            question: its name in ``questions.toml``, which says where to look it up, too.
+            question: its name in ``sentences.toml``, which says where to look it up, too.
             of: what it is asked of; what is asked of several becomes one question.
             known: the other fields of its text.
         """
-        own = _QUESTIONS[question]
+        own = _SENTENCES[question]
         text, where = (own[part].format(of="{}", **known) for part in ("ask", "where"))
         self.fill_in.setdefault((text, where), []).append(of)
         return f"  # fill in: {text.replace('{}', of)}"

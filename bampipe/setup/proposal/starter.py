@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bampipe.data.angle_torque import Reading
 from bampipe.data.guesses import Driven
 from bampipe.data.names import REFERENCE_WORDS, words
 from bampipe.data.survey import Survey, SurveyedColumn
@@ -14,6 +13,7 @@ from bampipe.data.vocabulary import word_set
 from bampipe.physics.device import KINDS
 from bampipe.physics.expression import FUNCTIONS
 from bampipe.setup.hypotheses import MOST_TRAVEL
+from bampipe.setup.proposal.notes import sentence
 from bampipe.setup.proposal.positions import in_counts
 
 _NAMELESS = word_set("nameless")
@@ -32,11 +32,6 @@ _SOURCES = {
 """Constants that only their user knows: value to start from, unit, and where to look them up."""
 
 _ANGLES, _UPRIGHT = map(word_set, ("turning", "upright"))
-_DOUBTS: dict[Reading, str] = {
-    "either": "a torque follows the angle, and over so short a travel a spring's looks alike",
-    "both": "a torque follows the angle, and neither weight nor a spring alone explains it; what is"
-    " beside it, a cable, a spring, a ripple, is for diagnose to name",
-}
 _LEAST_WEIGHT, _USUAL_GEAR = 1e-3, 10.0
 """Spread of a weight of which nothing shows, N.m; turns of a motor whose gear is not known."""
 
@@ -88,12 +83,9 @@ def weight_of(
         return None, ""
     reading = fit.pose.reading if fit.pose is not None else "nothing"
     if fit.pose is not None and reading == "spring" and not geared:
-        return None, (
-            "no gravity: a torque follows the position as that of a spring does, not as weight"
-            " does; diagnose has a name for it"
-        )
+        return None, sentence("spring")
     if fit.pose is not None and fit.pose.is_gravity:
-        doubt = _DOUBTS.get(reading, "")
+        doubt = sentence(reading) if reading in ("either", "both") else ""
         said = f"gravity: {doubt}" if doubt else "gravity, since the motion shows it"
         return Weight(fit.pose.moments, max(map(abs, fit.pose.moments)), doubt), said
     if not _may_carry(position, found, geared):

@@ -17,7 +17,7 @@ from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.matching import Match, Matcher
-from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted, sentence
 from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
 
 UNKNOWN_RATE = f'sample_rate_hz = "{UNKNOWN}"'
@@ -243,11 +243,8 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
         said = spelled(column.unit, _POSITION_UNITS)
         fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
         fields += f", scale_sd = {_rounded(sd / turns)}"
-        return entry(column.name, said, fields) + match.notes.guess(
-            f"{column.name} is the position of the motor of {axis.name}, which turns {turns:.4g} ±"
-            f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
-            " the angle; put in the ratio of the gear"
-        )
+        of = {"column": column.name, "axis": axis.name, "turns": turns, "sd": _rounded(sd)}
+        return entry(column.name, said, fields) + match.notes.guess(sentence("geared", **of))
     if column.name == match.geared:
         said = spelled(column.unit, _POSITION_UNITS)
         return entry(column.name, said, ", gear_ratio = 0.0") + match.notes.ask(
@@ -327,11 +324,9 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
         size = f"{(usual if is_usual else turn) / (2.0 * np.pi):.6g}"
         scale_sd = "" if is_usual else f", scale_sd = {_rounded(sd / turn)}"
         taken = f" ({usual:.0f}, as encoders have, is taken)" if is_usual else ""
-        return count(size, worth.zero, scale_sd) + match.notes.guess(
-            f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}{taken}, and"
-            f" {worth.zero:.0f} where it hangs, by its weight, which goes with the sine of the"
-            " angle; put in the encoder's counts a turn, times the gear, by 2 pi"
-        )
+        of = {"column": column.name, "axis": axis.name, "turn": turn, "sd": _rounded(sd)}
+        said = sentence("counts", **of, taken=taken, zero=worth.zero)
+        return count(size, worth.zero, scale_sd) + match.notes.guess(said)
     drawn = " of what is read where the drawing has 0" if match.robot.joints else ""
     ask = match.notes.ask(f"counts_{axis.unit}", axis.name, zero=drawn)
     return count("0.0", float(np.median(column.values))) + ask
