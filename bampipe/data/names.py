@@ -44,7 +44,7 @@ def words(name: str) -> list[str]:
     for foreign, english in VOCABULARY["other_scripts"].items():
         bare = bare.lower().replace(foreign, f" {english} ") if foreign in bare.lower() else bare
     bare = "".join(c for c in normalize("NFKD", bare.translate(_PLAIN)) if not combining(c))
-    parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare))
+    parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])|(?=[A-Z][a-z]{2})", "_", bare))
     return [word for part in parts if part for word in _parts_of(part.lower())]
 
 

@@ -17,15 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.readers import moments
-from bampipe.data.readers.trial import (
-    RawTrial,
-    Wanted,
-    aligned,
-    check_columns,
-    check_size,
-    interpolated,
-)
+from bampipe.data.readers import moments, trial
+from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
 from bampipe.data.units import SCALES, in_steps, units_beside
 from bampipe.errors import InputError, located
 from bampipe.lists import join_names
@@ -304,9 +297,9 @@ def _at_one_rate(arrays: Arrays) -> Arrays:
 
 
 def _resampled(at: Stored, times: Stored, values: Stored) -> np.ndarray:
-    t, own, table = (array.load().astype(float) for array in (at, times, values))
-    columns = table.reshape(own.size, -1).T
-    return np.column_stack([interpolated(t.ravel(), own.ravel(), column) for column in columns])
+    t, own = (array.load().astype(float).ravel() for array in (at, times))
+    columns = values.load().astype(float).reshape(own.size, -1).T
+    return np.column_stack([trial.interpolated(t, own, column) for column in columns])
 
 
 def _join_runs(arrays: Arrays) -> tuple[dict[str, Stored], dict[str, tuple[int, ...]]]:

@@ -64,7 +64,9 @@ class ProposedClock:
 
 def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     """Propose a clock: by stamps in one column or two, else by counting samples."""
-    unsaid = [c for c in found.columns if not c.role and np.any(np.diff(c.values) != 1.0)]
+    nameless = [c for c in found.columns if c.by_looks or not c.role]
+    numbers = {c.name for c in nameless if np.all(np.diff(c.values) == 1.0)}
+    unsaid = [c for c in found.columns if not c.role]
     counters = [c for c in unsaid if not _COUNTERS.isdisjoint(words(c.name))]
     unnamed = [c for c in unsaid if c not in counters and _counts_on(c)]
     whole = [c for c in found.of("time") if c.is_integer]
@@ -81,7 +83,8 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
         return c.name.endswith(_RECORDED), "stamp" not in words(c.name), not beside
 
     stamped = [*sorted(found.of("time"), key=rank), *counters, *unnamed]
-    column = next((c for c in stamped if _increases(c.values)), None)
+    rising = (c for c in stamped if c.name not in numbers and _increases(c.values))
+    column = next(rising, None)
     return _count_samples(found, notes) if column is None else _in_one_column(column, notes)
 
 
@@ -172,7 +175,9 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
                 where=found.trials[0].file,
                 remedy="sort its rows by their time",
             )
-        why = f"{stamps.name} falls at {np.sum(steps < 0)} and stands at {np.sum(steps == 0)} steps"
+        falls, stands = np.sum(steps < 0), np.sum(steps == 0)
+        why = f"{stamps.name} falls at {falls} and stands at {stands} steps"
+        why = why if falls or stands else f"{stamps.name} numbers the rows"
     if rates:
         why += f", and the rates are {join_names(f'{rates[n]:g} Hz by {n}' for n in rates)}"
     note = notes.guess(f"samples are counted: {why}")
