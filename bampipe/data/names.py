@@ -19,6 +19,7 @@ REFERENCE_WORDS = frozenset(_ROLE_WORDS["reference"].split())
 """Words for what a controller asks for rather than what was measured."""
 _BY_UNIT: Mapping[str, str] = VOCABULARY["roles_by_unit"]
 _VAGUE, _TERSE, _WORDY = map(word_set, ("vague", "terse", "wordy"))
+_PLAIN_POSITIONS, _PRESENT, _ANGLES = map(word_set, ("plain", "present", "angles"))
 _VELOCITY_UNIT = re.compile(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$")
 """Unit of a velocity at the end of a name."""
 _LONGEST_WORD = 2
@@ -31,9 +32,6 @@ FACTOR = re.compile(
 _UNIT_WORDS: Mapping[str, list[str]] = {
     role: text.split() for role, text in VOCABULARY["units_in_names"].items()
 }
-_PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
-_ANGLES = frozenset(["ang", "angle", "theta", "phi", "psi"])
-_PRESENT = frozenset(["current", "curr", "cur"])
 _OF_FIRST, _OF_UNIT, _OF_WORD, _OF_SUFFIX, _OF_LETTER, _OF_HINT = 6, 5, 4, 3, 2, 1
 """Weights of what tells the role of a column, from words for what is asked for to mere hints."""
 
@@ -102,7 +100,7 @@ def _evidence(name: str, stated: str) -> Iterator[tuple[str, float]]:
     if by_suffix := _role_by_suffix(name):
         terse = max(map(len, said), default=0) <= _LONGEST_WORD  # t_Nm
         yield by_suffix, _OF_WORD + 0.5 if terse else _OF_SUFFIX
-    for letter in re.split(r"\W|_", name)[1:]:
+    for letter in re.split(r"\W|_", name)[1:] if len(roles) > 1 else ():
         if letter in ("A", "V"):
             yield _role_by_unit(letter), _OF_LETTER + 0.5
     if "joint" in own:

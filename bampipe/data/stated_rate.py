@@ -23,7 +23,7 @@ _STATEMENT = re.compile(
     rf"(?P<value>{NUMBER})[ \t]*[\[(]?(?P<unit>[A-Za-z]+(?:/s)?)?"
 )
 _SAMPLES = r"(?:data|sampl\w*|abtast|scan|acquisition|logging|log|recording|frame)"
-_RATE = re.compile(rf"fs|fsample|{_SAMPLES}(?:rate|freq\w*)")
+_RATE = re.compile(rf"fs|fps|fsample|{_SAMPLES}(?:rate|freq\w*)")
 _INTERVAL = re.compile(
     rf"ts|dt|tsample|delta[tx]|interval|{_SAMPLES}(?:time|period|zeit|interval\w*)"
 )

@@ -240,10 +240,8 @@ class _Logs:
         known = {(c, u) for own in self.found.values() for c, u in own.items()}
         unsaid = {c for c, u in known if not u and not unit_of(c, "", role_of(c, ""))}
         said = units_stated(self.folder, self.found, unsaid)
-        self.found = {
-            name: {c: u or said.get(c, ("", ""))[0] for c, u in own.items()}
-            for name, own in self.found.items()
-        }
+        for own in self.found.values():
+            own |= {c: said[c][0] for c, u in own.items() if c in said and not u}
         self.remarks += [f"{c} is in {u}, as {file} says" for c, (u, file) in sorted(said.items())]
 
     def _read_one(self, name: str, columns: Mapping[str, str], *wanted: str) -> RawTrial:
@@ -511,11 +509,9 @@ def _by_looks(
 
     InputError where no column has a name, and none looks like a position.
     """
-    unnamed = [
-        c
-        for c in columns
-        if not c.is_constant and (not c.role or (c.role == "voltage" and not role_of(c.name, "")))
-    ]
+    # Volts are those of any sensor.
+    nameless = (c for c in columns if not role_of(c.name, "" if c.si == "V" else c.stated))
+    unnamed = [c for c in nameless if not c.is_constant]
     if any(c.role in ("position", "velocity") for c in columns) or not unnamed:
         return columns, []
     times = [c.values for c in columns if c.role == "time" and not c.is_constant]

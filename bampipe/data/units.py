@@ -91,7 +91,9 @@ def units_in(names: Iterable[str]) -> dict[str, str]:
         alone = match["unit"] == "1" and others and numbered[match["name"]] == 1
         return bool(_INDEX.fullmatch(match["unit"])) and not alone
 
-    return {n: m["unit"] for n, m in matches.items() if m["name"] and not is_index(m)}
+    units = {n: m["unit"] for n, m in matches.items() if m["name"] and not is_index(m)}
+    # Where all is in capitals, M and S are no names.
+    return {n: u.lower() if n.isupper() and u in ("M", "S") else u for n, u in units.items()}
 
 
 def units_beside(texts: Mapping[str, str]) -> dict[str, str]:

@@ -470,10 +470,8 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
         fitting.pop()
     for n in reversed(_filled(lines[:first])):
         row = cells(lines[n].text, delimiter)
-        if len(row) != width:
-            break
-        alone = row[0].lower() in _NAME_KEYS and not cells(lines[first].text, delimiter)[0]
-        if alone or _is_key_of_names(row):
+        begun = not cells(lines[first].text, delimiter)[0] and re.search(r"(?i)names?:?\Z", row[0])
+        if len(row) == width and (begun or _is_key_of_names(row)):
             return n
     wordy = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
     if wordy and wordy[-1] != fitting[-1]:

@@ -13,13 +13,12 @@ from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_spikes
 from bampipe.data.session import Register
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit
+from bampipe.data.vocabulary import word_set
 from bampipe.setup.proposal.notes import Notes
 
-SLIDING = frozenset(["stroke", "displacement", "disp", "dist", "weg", "hub", "carriage", "piston"])
+SLIDING, _SHARES = map(word_set, ("sliding", "shares"))
+_FORCES, _TORQUES = map(word_set, ("forces", "torques"))
 _FEWEST_COUNTS = 100
-_SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
-_FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
-_TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
 _MOST_WILD = 0.01
 """Share of the readings that are wild or missing, the most."""
 

@@ -175,9 +175,8 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
                 where=found.trials[0].file,
                 remedy="sort its rows by their time",
             )
-        falls, stands = np.sum(steps < 0), np.sum(steps == 0)
-        why = f"{stamps.name} falls at {falls} and stands at {stands} steps"
-        why = why if falls or stands else f"{stamps.name} numbers the rows"
+        why = f"{stamps.name} falls at {np.sum(steps < 0)} and stands at {np.sum(steps == 0)} steps"
+        why = why if steps.min() <= 0 else f"{stamps.name} numbers the rows"
     if rates:
         why += f", and the rates are {join_names(f'{rates[n]:g} Hz by {n}' for n in rates)}"
     note = notes.guess(f"samples are counted: {why}")
