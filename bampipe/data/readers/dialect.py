@@ -112,7 +112,8 @@ def cells(text: str, delimiter: str) -> list[str]:
     """The cells of one line, without the blanks around them."""
     if delimiter == " ":
         return text.split()
-    return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter), [])]
+    row = next(csv.reader([text.replace("\r", " ")], delimiter=delimiter), [])
+    return [cell.strip() for cell in row]
 
 
 def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableLayout:

@@ -83,9 +83,8 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
         return c.name.endswith(_RECORDED), "stamp" not in words(c.name), not beside
 
     stamped = [*sorted(found.of("time"), key=rank), *counters, *unnamed]
-    rising = (c for c in stamped if c.name not in numbers and _increases(c.values))
-    column = next(rising, None)
-    return _count_samples(found, notes) if column is None else _in_one_column(column, notes)
+    rising = [c for c in stamped if c.name not in numbers and _increases(c.values)]
+    return _in_one_column(rising[0], notes) if rising else _count_samples(found, notes)
 
 
 def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
