@@ -6,6 +6,7 @@ is written whole or not at all; the same rows give the same bytes.
 """
 
 import shutil
+import tomllib
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,34 +33,8 @@ def _table(*columns: str) -> dict[str, pa.DataType]:
     return {name: _KINDS[kind or "number"] for name, _, kind in pairs}
 
 
-TABLES: dict[str, dict[str, pa.DataType]] = {
-    "sessions": _table(
-        "sample_rate_hz", "trials:count", "trials_repaired:count", "trials_set_aside:count",
-        "models:texts", "counting_model:text", "effects:texts", "gates_failed:count",
-        "gates_warned:count", "failures:texts", "bampipe:text",
-    ),
-    "parameters": _table(
-        "model:text", "parameter:text", "axis:text", "estimate", "sd", "lower", "upper",
-        "unit:text", "at_bound:flag", "method:text",
-    ),
-    "stiffness": _table(
-        "axis:text", "stiffness", "sd", "lower", "upper", "unit:text", "bandwidth_hz",
-        "n_cycles:count",
-    ),
-    "errors": _table(
-        "model:text", "axis:text", "rmse", "rmse_without_friction", "held_out_rmse", "noise_floor",
-        "error_over_floor", "standing:text", "fit_percent", "unit:text",
-    ),
-    "verdicts": _table(
-        "model:text", "axis:text", "verdict:text", "effects:texts", "named:text", "likely:texts",
-        "probabilities:numbers", "unknown", "explained", "explainable_share", "rmse_before",
-        "rmse_after", "noise_floor", "unit:text", "sentence:text",
-    ),
-    "quality": _table(
-        "trial_id:text", "kind:text", "status:text", "reason:text", "repairs:text",
-        "n_samples:count", "duration_s", "sample_rate_hz", "nis",
-    ),
-}  # fmt: skip
+_COLUMNS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+TABLES: dict[str, dict[str, pa.DataType]] = {name: _table(*own) for name, own in _COLUMNS.items()}
 """Columns of each table; ``device`` stands in the path."""
 
 

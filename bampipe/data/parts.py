@@ -1,15 +1,18 @@
 """Which files of a folder are parts of one recording, by their names, lengths and clocks."""
 
 import re
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import and_
 from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.names import role_of
 from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
 from bampipe.data.readers.trial import Dialect
@@ -49,13 +52,12 @@ class FileClock:
 
 
 def join_parts(
-    folder: Path, found: Mapping[str, Columns], role: Callable[[str, str], str], dialect: Dialect
+    folder: Path, found: Mapping[str, Columns], dialect: Dialect
 ) -> tuple[list[TrialEntry], list[str]]:
     """Put together the files that are one recording.
 
     Args:
         folder, dialect: of the logs; found: columns and their units by file.
-        role: of a column by its name and unit, see `bampipe.data.survey`.
 
     Returns:
         The recordings, none where no files belong together, and for each file that seems to but
@@ -65,37 +67,38 @@ def join_parts(
         return [], []
     in_name = {name: _words(Path(name).name) for name in found}
     said = {
-        name: tuple(w for w in own if _AXIS.fullmatch(w) or role(w, "") not in ("", "time"))
+        name: tuple(w for w in own if _AXIS.fullmatch(w) or role_of(w, "") not in ("", "time"))
         for name, own in in_name.items()
     }
     # Files of a kind have the same columns, and the same quantities or axes in their names.
     kinds = {name: (frozenset(columns), said[name]) for name, columns in found.items()}
     # Words that all files of a kind have; numbers, if there are several, tell trials apart.
     own = {
-        kind: frozenset.intersection(*(frozenset(_words(n)) for n in found if kinds[n] == kind))
+        kind: reduce(and_, (Counter(_words(n)) for n in found if kinds[n] == kind))
         for kind in set(kinds.values())
     }
-    shared = frozenset.intersection(*own.values())
+    shared = reduce(and_, own.values())
     groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, kind in kinds.items():
-        words = (w for w in _words(name) if w not in said[name] and w not in own[kind])
-        groups[tuple(words)].append(name)
+        words = Counter(w for w in _words(name) if w not in said[name]) - own[kind]
+        groups[tuple(words.elements())].append(name)
     trials, reasons = [], []
     for names in groups.values():
         if len({kinds[name] for name in names}) != len(names) or len(names) < 2:
             continue
         called: dict[str, str] = {}
         for n in names:
-            name = _called(_words(n), own[kinds[n]] - shared, said[n])
+            beyond = own[kinds[n]] - shared
+            name = _called([w for w in own[kinds[n]] if w in beyond or w in said[n]])
             called[n] = f"{name}_{len(called)}" if name in called.values() else name
-        roles = {n: {role(f"{called[n]}:{c}", u) for c, u in found[n].items()} for n in names}
+        roles = {n: {role_of(f"{called[n]}:{c}", u) for c, u in found[n].items()} for n in names}
         main = max(names, key=lambda n: ("position" in roles[n], -names.index(n)))
         parts, alike = [], set()
-        own_clock = _read_clock(folder, main, found[main], role, dialect)
+        own_clock = _read_clock(folder, main, found[main], dialect)
         for other in names:
             if other == main:
                 continue
-            clock = _read_clock(folder, other, found[other], role, dialect, own_clock)
+            clock = _read_clock(folder, other, found[other], dialect, own_clock)
             try:
                 parts.append(_part(main, other, called[other], own_clock, clock))
             except InputError as error:
@@ -132,9 +135,9 @@ def _words(name: str) -> list[str]:
     return [part.lower() for part in parts]
 
 
-def _called(words: Sequence[str], own: frozenset[str], said: Sequence[str]) -> str:
-    """Name of a part: what its kind of file has in its name and other kinds have not."""
-    name = "_".join(dict.fromkeys(w for w in words if w in own or w in said))
+def _called(words: Iterable[str]) -> str:
+    """Name of a part by words that its kind of file has in its name and others have not."""
+    name = "_".join(words)
     return name[:_LONGEST] if re.match("[a-z]", name) else f"part_{name}".rstrip("_")[:_LONGEST]
 
 
@@ -180,12 +183,11 @@ def _read_clock(
     folder: Path,
     name: str,
     columns: Columns,
-    role: Callable[[str, str], str],
     dialect: Dialect,
     beside: FileClock | None = None,
 ) -> FileClock:
     """The clock of a file, in the unit in which it lasts as long as one ``beside`` if unstated."""
-    times = [column for column, unit in columns.items() if role(column, unit) == "time"]
+    times = [column for column, unit in columns.items() if role_of(column, unit) == "time"]
     datetimes = {column: "" for column in times if columns[column] == "datetime"}
     wanted = times or list(columns)[:1]
     raw = read_trial(folder / name, wanted, name=name, datetimes=datetimes, dialect=dialect)

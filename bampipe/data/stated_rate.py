@@ -6,24 +6,15 @@ from itertools import chain
 from pathlib import Path
 
 from bampipe.data.guesses import RATES_HZ
+from bampipe.data.names import role_of
 from bampipe.data.readers import extension_of, hdf5, is_text, text
 from bampipe.data.readers.trial import NUMBER
 from bampipe.data.units import unit
 
 _SMALL = 1 << 16
 """Bytes of what is written about logs, the most."""
-_NOTES = (
-    ".json",
-    ".yaml",
-    ".yml",
-    ".toml",
-    ".ini",
-    ".cfg",
-    ".txt",
-    ".md",
-    ".hdr",
-    ".info",
-    ".meta",
+_NOTES = frozenset(
+    [".json", ".yaml", ".yml", ".toml", ".ini", ".cfg", ".txt", ".md", ".hdr", ".info", ".meta"]
 )
 """File extensions of what is written about logs."""
 _STATEMENT = re.compile(
@@ -32,7 +23,7 @@ _STATEMENT = re.compile(
     rf"(?P<value>{NUMBER})[ \t]*[\[(]?(?P<unit>[A-Za-z]+(?:/s)?)?"
 )
 _SAMPLES = r"(?:data|sampl\w*|abtast|scan|acquisition|logging|log|recording|frame)"
-_RATE = re.compile(rf"fs|fsample|{_SAMPLES}(?:rate|freq\w*)")
+_RATE = re.compile(rf"fs|fps|fsample|{_SAMPLES}(?:rate|freq\w*)")
 _INTERVAL = re.compile(
     rf"ts|dt|tsample|delta[tx]|interval|{_SAMPLES}(?:time|period|zeit|interval\w*)"
 )
@@ -61,15 +52,41 @@ def interval_of(name: str, value: float, said: str = "") -> float:
 
 def intervals_stated(folder: Path, logs: Collection[str]) -> dict[str, float]:
     """Sampling intervals, s, by file and name: of ``logs``, and of notes written beside them."""
-    notes = (path for path in sorted(folder.rglob("*")) if extension_of(path.name) in _NOTES)
-    beside = [p for p in notes if p.is_file() and p.stat().st_size < _SMALL]
     found = dict[str, float]()
-    for path in [*(folder / name for name in sorted(logs)), *beside]:
+    for path in [*(folder / name for name in sorted(logs)), *_notes(folder)]:
         file = path.relative_to(folder).as_posix()
         for name, value, said in _numbers_of(path, file in logs):
             step = interval_of(name, value, said)
             found |= {f"{name} in {file}": step} if step else {}
     return found
+
+
+def units_stated(
+    folder: Path, logs: Collection[str], names: Collection[str]
+) -> dict[str, tuple[str, str]]:
+    """Units of columns by what is written beside ``logs`` (``torque: N mm``), and in which file.
+
+    A line begins with the name of the column, or has it in quotes. Units that contradict one
+    another, or the name, are left out.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for path in _notes(folder) if names else ():
+        file = path.relative_to(folder).as_posix()
+        said = path.read_text("utf-8", "replace") if file not in logs else ""
+        for name in names:
+            line = rf"(?im)(?:^[\W_]*|[\"',{{]\s*){re.escape(name)}[\"'`*]*[\s:=|,([-]+(.*)"
+            for match in re.finditer(line, said):
+                parts = map(str.strip, re.split(r"[][(){},;|\"']|\bin\b", match[1]))
+                known = (x for x in parts if not re.match(r"[^\WsmgNAV]?\Z|\d", x) and unit(x))
+                own = next((x for x in known if role_of(name, "") in ("", role_of("", x))), "")
+                found.setdefault(name, {}).update({own: file} if own else {})
+    agreed = {name: own for name, own in found.items() if len({unit(x) for x in own}) == 1}
+    return {name: next(iter(own.items())) for name, own in agreed.items()}
+
+
+def _notes(folder: Path) -> list[Path]:
+    notes = (path for path in sorted(folder.rglob("*")) if extension_of(path.name) in _NOTES)
+    return [p for p in notes if p.is_file() and p.stat().st_size < _SMALL]
 
 
 def _numbers_of(path: Path, is_log: bool) -> Iterator[tuple[str, float, str]]:

@@ -6,12 +6,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
-from unicodedata import combining, normalize
 
 import numpy as np
 
 from bampipe.data import readers
 from bampipe.data.guesses import MOST_IN_TURN, describe, find_roles, is_time, take_turns
+from bampipe.data.names import DRIVERS, FACTOR, REFERENCE_WORDS, role_of, unit_of, words
 from bampipe.data.parts import axes_of, join_parts
 from bampipe.data.readers import columns_of, extension_of, is_log, is_text, lerobot, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
@@ -19,109 +19,30 @@ from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS
 from bampipe.data.session.file import lexically_inside
-from bampipe.data.stated_rate import intervals_stated
+from bampipe.data.stated_rate import intervals_stated, units_stated
 from bampipe.data.units import RecordedUnit, spelled, unit
+from bampipe.data.vocabulary import by_word, word_set
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 
 MOST_FILES = 500
 _MOST_COLUMNS = 500
 """Of a table of samples, unless it has many rows."""
-_OTHER_DATA = {
-    **dict.fromkeys((".xls", ".ods"), "save the sheet as .xlsx or CSV"),
-    **dict.fromkeys((".db", ".sqlite", ".sqlite3"), "export its table as CSV"),
-    **dict.fromkeys((".pkl", ".pickle", ".joblib"), "it may run any program; save with np.savez"),
-    **dict.fromkeys((".orc", ".rds"), "save it as Parquet or CSV"),
-    **dict.fromkeys((".zip", ".gz", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
-    **dict.fromkeys(
-        (".c3d", ".mf4", ".mdf", ".blf", ".bin", ".ulg", ".tlog", ".trc", ".r64", ".fig", ".slx"),
-        "export its channels as CSV, a sample a row",
-    ),
-}
-"""Files of data that are not read, and what to do."""
+_OTHER_DATA = by_word("unreadable")
+"""What to do with files of data that are not read."""
 _SMALL = 1 << 16
 """Bytes below which a text may be no log but a line of results."""
 _MOST_SCANNED = 1 << 30
 """Bytes of text in which other recordings are looked for; reading them takes some seconds."""
+_OTHER = "other columns, for another session"
 _WHOLE = 2
 """Of logs that hold both a motion and what drives it."""
 _RISES = 0.8
 """Share of samples at which a clock rises, if what else it does is an accident."""
-_GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
-"""Words in the name of a column that say less of it than the name of its file."""
-_WORDS = {
-    "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
-    " msec usec nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
-    " tid czas cas zaman aika ido ipoc timer",
-    "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
-    " wanted con ctrl action ziel consigne consigna referencia riferimento planned requested",
-    "brake": "brake bremse",
-    "acceleration": "acc accel acceleration qdd ddq beschleunigung aceleracion accelerazione",
-    "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate vitesse"
-    " velocidad velocidade velocita snelheid predkosc rychlost hiz hastighet",
-    "force": "force forc f fx fy fz torque tau trq kraft moment drehmoment loadcell wrench effort"
-    " eff couple fuerza forza forca par coppia momento koppel vridmoment tork kuvvet sila",
-    "current": "current curr cur i iq amp amps ampere strom coil courant corriente corrente stroom",
-    "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung tension"
-    " voltaje tensao tensione",
-    "position": "pos position ang angle theta phi psi q enc encoder disp displacement dist x stroke"
-    " winkel weg lage hub joint deflection yaw pitch extension carriage counts pot poti"
-    " posicion posicao posizione angulo angolo hoek vinkel kat uhel aci konum poloha course"
-    " inkremente",
-}
-_SIGNS = {
-    "加速度": "acc", "速度": "velocity", "力矩": "torque", "扭矩": "torque", "转矩": "torque",
-    "トルク": "torque", "时间": "time", "時間": "time", "角度": "angle", "位置": "position",
-    "位移": "displacement", "电流": "current", "電流": "current", "电压": "voltage",
-    "電圧": "voltage",
-    "目标": "target", "目標": "target", "期望": "desired", "指令": "command", "力": "force",
-    "время": "time", "угол": "angle", "скорость": "velocity", "момент": "torque", "ток": "current",
-}  # fmt: skip
-"""Words of other scripts; of those inside others the longer comes first."""
-_PLAIN = str.maketrans({"ı": "i", "ł": "l", "Ł": "L", "ø": "o", "ß": "ss", "µ": "u", "μ": "u"})
-_ALL_WORDS = frozenset(word for text in _WORDS.values() for word in text.split())
-_ENDS = sorted((word for word in _ALL_WORDS if len(word) > 4 or word in ("time", "zeit")), key=len)
-_RUN_TOGETHER = re.compile(r"(q|dq|tau|trq|pos|vel)(des|ref|cmd|meas|msr|act)")
-REFERENCE_WORDS = frozenset(_WORDS["reference"].split())
-"""Words for what a controller asks for rather than what was measured."""
-_ASKED = frozenset(
-    ["desired", "des", "reference", "ref", "setpoint", "target", "planned", "sim", "simulated"]
-)
-_TWINS = _ASKED | {"measured", "meas", "actual", "act", "real", "feedback"}
+_ASKED = word_set("asked")
+_TWINS = _ASKED | word_set("measured")
 """Words in the name of a file of what was asked for, and in that of the measurement beside it."""
-DRIVERS = ("force", "current", "voltage")
-"""Roles of what may drive an axis."""
-_BY_UNIT = {
-    "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
-    "m/s": "velocity", "kg": "force", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
-}  # fmt: skip
-_SHORT_UNITS = frozenset(["mm", "Nm", "kN", "gf", "mA", "mV"])
-_LONG_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano", "meter"])
-"""Units of two letters at the end of a name that are no words, and longer ones that are."""
-_VELOCITY_UNIT = re.compile(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$")
-"""Unit of a velocity at the end of a name."""
-_PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
-_PRESENT = frozenset(["current", "curr", "cur"])
-_LONGEST_WORD = 2
-"""Letters at the end of a name that are a word rather than a unit, such as the in of pos_in."""
-_FACTOR = re.compile(
-    r"(?i)(?:\s?[*×]\s?|[_ .(]+(?:x ?|(?:div|by|times)[_ ]?|(?=1?e\d\Z|10+0\Z)))"
-    r"(?:1?e\d|10+|\d{3,})(?![a-z\d.])"
-)
-"""In a name, what its unit is multiplied by, or its numbers are."""
-_JOINED = {
-    "rows": "row by row",
-    "time": "by their times",
-    "start": "by their times, as if begun together",
-}
-_UNIT_WORDS = {
-    "time": ("us", "ms", "ns", "s", "min"),
-    "position": ("mrad", "rad", "deg", "°", "mm", "cm", "um", "nm", "m"),
-    "velocity": ("rad/s", "deg/s", "mm/s", "m/s", "rpm"),
-    "force": ("mNm", "Ncm", "Nmm", "Nm", "kN", "cN", "mN", "N", "V", "kp", "kg", "g", "gf", "%"),
-    "current": ("mA", "A"),
-    "voltage": ("mV", "V", "percent", "pct", "%"),
-}
+_JOINED = {"rows": "row by row", "time": "by their times", "start": "as if begun together"}
 
 
 @dataclass(frozen=True)
@@ -213,6 +134,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     dataset = lerobot.open_dataset(folder, episodes)
     logs = _Logs(folder, Dialect(names=tuple(names)), dataset)
     logs.look_through([folder / file for file in dataset.episodes] if dataset else logs.paths())
+    logs.hear_notes()
     trials, common = logs.choose()
     read: tuple[SurveyedColumn, ...] = ()
     sound = []
@@ -227,7 +149,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
         raise logs.fault()
     columns, guessed = _by_looks(_with_commands(list(read)), folder)
     # The first unit of a quantity is that of the first column which looks like it.
-    units = {_role(x, u): u for x, u in reversed(logs.beside.items()) if unit(u) is not None}
+    units = {role_of(x, u): u for x, u in reversed(logs.beside.items()) if unit(u) is not None}
     columns = tuple(
         replace(c, unit=units.pop(c.role), by_looks=False) if c.by_looks and c.role in units else c
         for c in columns
@@ -281,7 +203,8 @@ class _Logs:
                 remedy=self.passed[0][1]
                 if self.passed
                 else f"supported file extensions are {', '.join(readers.EXTENSIONS)}"
-                + "; of XML, name it *.txt" * any(name.endswith(".xml") for name in others),
+                + "; of YAML, ros2 topic echo --csv makes a table"
+                * any(name.endswith((".yaml", ".yml")) for name in others),
             )
         if len(paths) > MOST_FILES:
             raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
@@ -311,6 +234,15 @@ class _Logs:
                 self.passed.append((name, str(error)))
         if not self.found:
             raise self.fault()
+
+    def hear_notes(self) -> None:
+        """Give columns that state no unit that of notes beside the logs."""
+        known = {(c, u) for own in self.found.values() for c, u in own.items()}
+        unsaid = {c for c, u in known if not u and not unit_of(c, "", role_of(c, ""))}
+        said = units_stated(self.folder, self.found, unsaid)
+        for own in self.found.values():
+            own |= {c: said[c][0] for c, u in own.items() if c in said and not u}
+        self.remarks += [f"{c} is in {u}, as {file} says" for c, (u, file) in sorted(said.items())]
 
     def _read_one(self, name: str, columns: Mapping[str, str], *wanted: str) -> RawTrial:
         moments = {column: "" for column in wanted if columns[column] == "datetime"}
@@ -343,11 +275,11 @@ class _Logs:
             self._leave_out(self._asked(self._with(common)), "asked for or simulated, by name")
         names = self._with(common)
         stated = self.found[names[0]]
-        several = [_role(column, stated[column]) for column in common].count("position") > 1
+        several = [role_of(column, stated[column]) for column in common].count("position") > 1
         axes = {} if several else axes_of(names)  # of which each has all joints are trials
         if not whole or axes:
             pool = {n: self.found[n] for n in names} if axes and whole else self.found
-            trials, reasons = join_parts(self.folder, pool, _role, self.dialect)
+            trials, reasons = join_parts(self.folder, pool, self.dialect)
             shared = [set(self._labels(trial)) for trial in trials]
             best = max(shared, key=lambda own: (shared.count(own), len(own)), default=set())
             trials = [trial for trial, has in zip(trials, shared, strict=True) if best <= has]
@@ -366,12 +298,34 @@ class _Logs:
             others = [name for name in names if axes[name] != axis]
             self._leave_out(others, f"not of {axis}, by name: for another session")
             names = [name for name in names if name not in others]
-        self._leave_out(self.found.keys() - set(names))
-        return [TrialEntry(file=n, kind="free") for n in names], [c for c in stated if c in common]
+        pairs = {n: self._renamed(names[0], n, common) for n in self.found if n not in names}
+        renamed = {name: own for name, own in pairs.items() if own}
+        for name in self.found.keys() - {*names, *renamed}:
+            lacking = [c for c in stated if c in common - self.found[name].keys()]
+            self._leave_out([name], f"{_OTHER}, without {join_names(lacking, 3)}")
+        trials = [TrialEntry(file=n, kind="free") for n in names]
+        trials += [TrialEntry(file=n, kind="free", columns=own) for n, own in renamed.items()]
+        return trials, [c for c in stated if c in common]
 
-    def _leave_out(
-        self, names: Collection[str], why: str = "other columns, for another session"
-    ) -> None:
+    def _renamed(self, first: str, other: str, common: frozenset[str]) -> dict[str, str]:
+        """Columns of another file by those of the first, where words of its own name are in theirs.
+
+        None unless it has all, with the same units.
+        """
+
+        def bare(file: str, columns: Collection[str]) -> dict[tuple[str, ...], str]:
+            own = {*re.findall(r"[a-z]+|\d+", file.rpartition(".")[0].lower())}
+            split = {c: re.findall(r"[^\W\d_]+|\d+|%", c.lower()) for c in columns}
+            return {tuple(w for w in said if w not in own): c for c, said in split.items()}
+
+        here, there = bare(first, common), bare(other, self.found[other])
+        if len(here) < len(common) or not here.keys() <= there.keys():
+            return {}
+        pairs = {column: there[key] for key, column in here.items()}
+        alike = all(self.found[first][x] == self.found[other][y] for x, y in pairs.items())
+        return pairs if alike else {}
+
+    def _leave_out(self, names: Collection[str], why: str = _OTHER) -> None:
         self.passed += [(name, why) for name in self.found if name in names]
         self.found = {name: own for name, own in self.found.items() if name not in names}
 
@@ -395,12 +349,12 @@ class _Logs:
         stated = {column: self.found[names[0]][column] for column in columns}
         sizes = sum((self.folder / name).stat().st_size for name in names)
         # Without its time a log is worth half.
-        timed = any(_role(*column) == "time" for column in stated.items())
+        timed = any(role_of(*column) == "time" for column in stated.items())
         return self._completeness(stated), (1 + timed) * sizes, len(columns)
 
     @staticmethod
     def _completeness(stated: Mapping[str, str]) -> int:
-        roles = [_role(*column) for column in stated.items()]
+        roles = [role_of(*column) for column in stated.items()]
         moves, driven = {"position", "velocity"}, {*DRIVERS, "reference"}
         if moves & set(roles) and driven & set(roles):
             return _WHOLE
@@ -411,15 +365,15 @@ class _Logs:
         labels: dict[str, str] = {}
         for name, file in ((trial.part, trial.file), *((p.name, p.file) for p in trial.parts)):
             for column, stated in self.found[file].items():
-                timed = any(_role(label, unit) == "time" for label, unit in labels.items())
-                if file != trial.file and timed and _role(column, stated) == "time":
+                timed = any(role_of(label, unit) == "time" for label, unit in labels.items())
+                if file != trial.file and timed and role_of(column, stated) == "time":
                     continue
                 labels[f"{name}:{column}" if name else column] = stated
         return labels
 
     def _refuse_parted(self, first: str, reasons: Sequence[str]) -> None:
         """Refuse logs that have their positions in one file and what drives them in another."""
-        roles = {n: {_role(*column) for column in c.items()} for n, c in self.found.items()}
+        roles = {n: {role_of(*column) for column in c.items()} for n, c in self.found.items()}
         for here, there in (({"position"}, set(DRIVERS)), (set(DRIVERS), {"position"})):
             if here & roles[first] and not (there | {"reference"}) & roles[first]:
                 other = next((name for name, other in roles.items() if there & other), "")
@@ -437,7 +391,7 @@ class _Logs:
     def read(self, trial: TrialEntry, wanted: Sequence[str]) -> tuple[SurveyedColumn, ...]:
         """The columns of one recording."""
         labels = self._labels(trial)
-        times = [column for column in wanted if _role(column, labels[column]) == "time"]
+        times = [column for column in wanted if role_of(column, labels[column]) == "time"]
         moments = [column for column in times if labels[column] == "datetime"]
         dropped = [c for c in wanted if labels[c] == "datetime" and c not in moments[:1]]
         # A reader of several topics takes the first column for the time.
@@ -448,7 +402,7 @@ class _Logs:
             said = "datetime" if moments else spelled(labels[column], CLOCK_UNITS)
             clock = Clock(column=column, unit=next((u for u in CLOCK_UNITS if u == said), "s"))
         # Of several rates, that of the positions counts.
-        first = sorted(ordered, key=lambda c: (c not in times, _role(c, labels[c]) != "position"))
+        first = sorted(ordered, key=lambda c: (c not in times, role_of(c, labels[c]) != "position"))
         raw = read_recording(self.folder, trial, first, clock, self.dialect)
         self.beside = {
             x.rpartition(":")[2]: u for x, u in raw.units.items() if x not in raw.columns
@@ -471,12 +425,12 @@ class _Logs:
         found = []
         for column in ordered:
             said = raw.units.get(column, labels[column])
-            role = _role(column, said)
-            if role and clock.column != column and re.search(r":column_\d+$", column):
-                # Of files without a header, named for what the rest of their columns is.
+            role = role_of(column, said)
+            if role and clock.column != column and re.search(r":column_\d+$|\[0\]$", column):
+                # Of files without a header or a matrix, named for what the rest of it is.
                 role = "time" if is_time(raw.columns[column][sound]) else role
-            unit = _unit(column, said, role)
-            factor = _FACTOR.search(column)
+            unit = unit_of(column, said, role)
+            factor = FACTOR.search(column)
             if unit and factor and factor[0] not in unit:
                 unit = said = f"{unit}, {factor[0].strip('_. (')}"
             found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
@@ -507,9 +461,9 @@ class _Logs:
         several = is_text(trial.file) or any("[:]." in column for column in columns)
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
-        times = [c for c, u in columns.items() if _role(c, u) == "time"]
+        times = [c for c, u in columns.items() if role_of(c, u) == "time"]
         column = (times or sorted(columns, key=lambda name: "[:]." not in name))[0]
-        moving = [c for c, u in columns.items() if _role(c, u) == "position"] if times else []
+        moving = [c for c, u in columns.items() if role_of(c, u) == "position"] if times else []
         raw = self._read_one(trial.file, columns, column, *moving)
         starts = starts_of(raw, column if times else "")
         if len(starts) == 1:
@@ -555,7 +509,9 @@ def _by_looks(
 
     InputError where no column has a name, and none looks like a position.
     """
-    unnamed = [c for c in columns if not c.role and not c.is_constant]
+    # Volts are those of any sensor.
+    nameless = (c for c in columns if not role_of(c.name, "" if c.si == "V" else c.stated))
+    unnamed = [c for c in nameless if not c.is_constant]
     if any(c.role in ("position", "velocity") for c in columns) or not unnamed:
         return columns, []
     times = [c.values for c in columns if c.role == "time" and not c.is_constant]
@@ -594,102 +550,8 @@ def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
     wanted = ("current",) if measured == ["force"] else () if measured else DRIVERS
     found = []
     for column in columns:
-        said = set(words(column.name)) - REFERENCE_WORDS
-        named = (role for role in DRIVERS if said & set(_WORDS[role].split()))
-        role = _role_by_unit(column.stated) or next(named, "")
+        bare = "_".join(word for word in words(column.name) if word not in REFERENCE_WORDS)
+        role = role_of(bare, column.stated)
         commands = column.role == "reference" and role in wanted
         found.append(replace(column, role=role) if commands else column)
     return tuple(found)
-
-
-def words(name: str) -> list[str]:
-    """The words in the name of a column, in lower case and without accents; of compounds, each."""
-    bare = re.sub(r"[\[(（].*?[\])）]", " ", name)
-    for foreign, english in _SIGNS.items():
-        bare = bare.lower().replace(foreign, f" {english} ") if foreign in bare.lower() else bare
-    bare = "".join(c for c in normalize("NFKD", bare.translate(_PLAIN)) if not combining(c))
-    parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare))
-    return [word for part in parts if part for word in _parts_of(part.lower())]
-
-
-def _parts_of(word: str) -> list[str]:
-    """A word, or the two that it is put together from, such as ``motorstrom`` and ``qdes``."""
-    if match := _RUN_TOGETHER.fullmatch(word):
-        return [*match.groups()]
-    end = next((end for end in reversed(_ENDS) if word.endswith(end)), word)
-    start = word.removesuffix(end)
-    return [start, end] if len(start) > 1 and word not in _ALL_WORDS else [word]
-
-
-def _role(name: str, stated: str) -> str:
-    """What a column is, by its unit and its name, and by the part of a recording it is in."""
-    part, colon, bare = name.partition(":")
-    if colon and not part.startswith("/"):
-        alone = _role(bare, stated)
-        vague = set(words(bare)) <= _GENERAL or not alone
-        return (vague and _role(part, "")) or alone
-    plain = name.strip()
-    named = plain.lower() in _UNIT_WORDS["time"] or plain.lower().startswith("x_value")
-    if stated == "datetime" or named or plain.rpartition(".")[2] == "ts":  # Ts: rather an interval
-        return "time"
-    said = set(words(name))
-    said |= {word.removesuffix(end) for word in said for end in ("s", "ed") if len(word) > 3}
-    if {"load", "cell"} <= said:
-        return "force"
-    first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]
-    if first:
-        return first[0]
-    if said & _PLAIN_POSITIONS and said & _PRESENT:
-        said -= _PRESENT  # the position that is current, and no current
-    roles = [role for role, text in _WORDS.items() if said & set(text.split())]
-    role, own = _role_by_unit(stated), [r for r in roles if r in ("position", "force")]
-    if role == "voltage" and len(own) == 1:
-        return own[0]  # of a sensor, whose volts stand for what it measures
-    if role:
-        return role
-    if max(map(len, said), default=0) <= _LONGEST_WORD and (by_unit := _role_by_suffix(name)):
-        return by_unit  # t_Nm
-    if len(roles) > 1 and (longer := {word for word in said if len(word) > 1}):
-        roles = [r for r in roles if longer & set(_WORDS[r].split())] or roles  # T.Angle
-    elif len(roles) > 1:
-        # x_F: letters that stand for several quantities
-        return next((_role_by_unit(x) for x in re.split(r"\W|_", name)[1:] if x in ("A", "V")), "")
-    if not roles and name.startswith(lerobot.STATE):
-        return "voltage" if "load" in name else "position"
-    return next(iter(roles), "") or _role_by_suffix(name)
-
-
-def _role_by_unit(text: str) -> str:
-    known = unit(text)
-    return _BY_UNIT.get(known.si, "") if known is not None else ""
-
-
-def _role_by_suffix(name: str) -> str:
-    """The role by a unit at the end of a name that says nothing else."""
-    if _VELOCITY_UNIT.search(name):
-        return "velocity"
-    suffix = re.split(r"[_\W]+", name)[-1]
-    long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _LONG_WORDS
-    role = _role_by_unit(suffix) if long or suffix in _SHORT_UNITS else ""
-    return role if role != "time" else ""
-
-
-def _unit(name: str, stated: str, role: str) -> str:
-    """Unit by the file, or by a last word of the name such as ``_us``, before an index if any."""
-    if stated:
-        return "rev/s" if role == "velocity" and unit(stated) == unit("Hz") else stated
-    bare = re.sub(r"(\[\d+\]|_\d+)$", "", _FACTOR.sub("", name.translate(_PLAIN)))
-    if role == "velocity" and (rate := _VELOCITY_UNIT.search(bare)):
-        return f"{rate[1]}/s"
-    parts = re.findall(r"(?:\d+\.(?=\d))?[^\W_]+|[°%]", bare)
-    both = ".".join(parts[-2:]) if role == "force" and len(parts) > 2 else ""  # in_lbs, not in_N
-    if re.match("in.(lb|oz)|(?!in.)", both.lower()) and (arm := unit(both)) and arm.si == "N.m":
-        return both
-    known = _UNIT_WORDS.get(role, ())
-    inner = (part for part in parts[-2:0:-1] if len(part) > 1 and part in known)  # pos_mm_act
-    for suffix in (*parts[1:][-1:], *inner):
-        matches = [u for u in known if u.lower() == suffix.lower()]
-        long = role not in ("", "time") and len(suffix) > _LONGEST_WORD
-        if matches or (long and _role_by_unit(suffix) == role):
-            return next(iter(matches), suffix)
-    return ""

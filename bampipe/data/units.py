@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bampipe.data.vocabulary import by_word
+
 
 @dataclass(frozen=True)
 class RecordedUnit:
@@ -38,25 +40,9 @@ _LOGGED = frozenset(["", *_ORDER, "N.m", "rad/s", "rad/s2", "m/s", "m/s2"])
 """SI units of what is logged."""
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "da": 10.0, "k": 1e3, "M": 1e6}
 _PREFIXED = frozenset(["s", "m", "rad", "deg", "N", "A", "V", "W", "Hz", "Pa", "T", "g", "bar"])
-_WHOLE = {
-    "1/min": "rev/min", "min1": "rev/min", "-": "", "1": "",
-    "none": "", "ozin": "ozf.in", "kgcm": "kgf.cm", "inlb": "lbf.in", "lbin": "lbf.in",
-    "ftlb": "lbf.ft", "lbft": "lbf.ft", "kgfcm": "kgf.cm",
-}  # fmt: skip
+_WHOLE = by_word("whole_units")
 _RATES = {"rpm": "rev/min", "r/min": "rev/min", "rps": "rev/s", "dps": "deg/s"}
-_SPELLINGS = {
-    "rot": "rev", "turn": "rev", "degree": "deg", "°": "deg", "Grad": "deg", "micron": "um",
-    "º": "deg", "radian": "rad", "revolution": "rev", "rotation": "rev", "second": "s",
-    "sec": "s", "minute": "min", "millisecond": "ms", "microsecond": "us", "nanosecond": "ns",
-    "milli": "ms", "micro": "us", "nano": "ns", "msec": "ms", "usec": "us", "nsec": "ns",
-    "volt": "V", "v": "V", "amp": "A", "ampere": "A", "a": "A", "n": "N", "newton": "N",
-    "newtonmeter": "Nm", "kn": "kN", "milliamp": "mA", "meter": "m", "metre": "m", "gram": "g",
-    "millimeter": "mm", "millimetre": "mm", "centimeter": "cm", "inch": "in", "inche": "in",
-    "foot": "ft", "feet": "ft", "lb": "lbf", "pound": "lbf", "oz": "ozf", "hz": "Hz",
-    "percent": "%", "pct": "%", "Arms": "A", "Vdc": "V", "Vrms": "V", "U": "rev", "Umdr": "rev",
-    "tr": "rev", "grado": "deg", "grados": "deg", "grader": "deg", "derece": "deg", "degré": "deg",
-}  # fmt: skip
-"""Of single factors; those in the plural are found without their s."""
+_SPELLINGS = by_word("unit_spellings")
 _PLAIN = str.maketrans("µμ×⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "uux-0123456789")
 _CELSIUS = frozenset(["degc", "°c", "c", "celsius"])
 _NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
@@ -105,7 +91,9 @@ def units_in(names: Iterable[str]) -> dict[str, str]:
         alone = match["unit"] == "1" and others and numbered[match["name"]] == 1
         return bool(_INDEX.fullmatch(match["unit"])) and not alone
 
-    return {n: m["unit"] for n, m in matches.items() if m["name"] and not is_index(m)}
+    units = {n: m["unit"] for n, m in matches.items() if m["name"] and not is_index(m)}
+    # Where all is in capitals, M and S are no names.
+    return {n: u.lower() if n.isupper() and u in ("M", "S") else u for n, u in units.items()}
 
 
 def units_beside(texts: Mapping[str, str]) -> dict[str, str]:

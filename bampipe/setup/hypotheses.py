@@ -9,19 +9,11 @@ from itertools import combinations, permutations
 import numpy as np
 
 from bampipe.data import units
+from bampipe.data.vocabulary import VOCABULARY
 from bampipe.results.setup import Kind
 from bampipe.trials.signals import Change, Signals
 
 _Units = tuple[str, str]
-CONFUSED = {
-    "rad": ("deg", "rev", "mrad"),
-    "m": ("mm", "cm", "um", "in"),
-    "N": ("mN", "kN", "kgf", "gf", "lbf"),
-    "N.m": ("mN.m", "kN.m", "N.mm", "N.cm"),
-    "A": ("mA",),
-    "V": ("mV",),
-}
-"""By SI unit, units that are mistaken for it or it for them."""
 PLAIN = (10.0, 100.0, 1000.0, 2.0, 4.0)
 """Factors of amplifier gains and of encoder edges that are forgotten or applied twice."""
 MOST_TRAVEL = 4.0 * math.pi
@@ -110,7 +102,7 @@ def _usual_scales(signals: Signals, names: Sequence[str]) -> Iterator[tuple[floa
     """Yield factor, cost, and (meant, stated) of units that are mistaken for others, and gains."""
     place = signals.places(names)[0]
     si, stated = signals.units[place], signals.stated[place]
-    for name in CONFUSED.get(si, ()):
+    for name in VOCABULARY["confused_units"].get(si, "").split():
         known = units.unit(name)
         cost = 0.5 if name in USUAL else 2.0
         if known is not None and stated == si:

@@ -90,15 +90,6 @@ def test_hdf5_refused(hdf5, column, said):
     assert said in refused(hdf5, ("log/t", column))
 
 
-def test_columns_of_matrices_in_matlab_files(tmp_path):
-    path = tmp_path / "a.mat"
-    scipy.io.savemat(path, {"X": np.column_stack([T, Q, F]), "s": {"q": Q}})
-    trial = read_trial(path, ("X[0]", "X[2]"))
-    np.testing.assert_array_equal(trial.columns["X[2]"], F)
-    assert list(columns_of(path)) == ["X[0]", "X[1]", "X[2]", "s.q"]
-    assert "a structure, expected a vector of numbers" in refused(path, ("X[0]", "s"))
-
-
 @pytest.mark.parametrize("compressed", [False, True])
 def test_fields_of_matlab_structs(tmp_path, compressed):
     path = tmp_path / "a.mat"
@@ -173,6 +164,19 @@ def test_moments_in_parquet(tmp_path):
     assert 'say unit = "datetime" under [time]' in refused(path, ("when", "q"))
 
 
+def test_a_trial_a_row_of_parquet_and_signals_at_rates_of_their_own(tmp_path):
+    path, t = tmp_path / "a.parquet", np.arange(200.0)
+    pd.DataFrame({"trial": [1, 2], "t": [t, t], "q": [t, -t]}).to_parquet(path)
+    trial = read_trial(path, ("trial[:].t", "trial[:].q"))
+    np.testing.assert_array_equal(trial.columns["trial[:].q"], np.concatenate([t, -t]))
+    assert trial.begun == (200,)
+    signals = {"q": {"Time": t, "Data": 2.0 * t}, "u": {"Time": t[::2], "Data": 3.0 * t[::2]}}
+    scipy.io.savemat(tmp_path / "a.mat", {"out": signals})
+    trial = read_trial(tmp_path / "a.mat", ("out.q.Time", "out.u.Data"))
+    np.testing.assert_allclose(trial.columns["out.u.Data"][:-1], 3.0 * t[:-1])
+    assert trial.remarks == ("interpolated linearly at the times of the longest: out.u.Data",)
+
+
 # TDMS
 
 
@@ -225,16 +229,15 @@ def test_the_sheet_with_most_rows_of_a_workbook_is_read(tmp_path):
     openpyxl = pytest.importorskip("openpyxl")
     book = openpyxl.Workbook()
     book.active.append(["notes of the day"])
-    book.active.append(["by K. M."])
-    sheet = book.create_sheet("log")
-    sheet.append(["Time [s]", "Force [N]"])
-    for row in zip(T, F, strict=True):
-        sheet.append([float(x) for x in row])
+    for sheet in (book.create_sheet("log"), book.create_sheet("log 2")):
+        sheet.append(["Time [s]", "Force [N]"])
+        for row in zip(T, F, strict=True):
+            sheet.append([float(x) for x in row])
     path = tmp_path / "a.xlsx"
     book.save(path)
     trial = read_trial(path, ("Time [s]", "Force [N]"))
-    np.testing.assert_array_equal(trial.columns["Time [s]"], T)
-    np.testing.assert_array_equal(trial.columns["Force [N]"], F)
+    np.testing.assert_array_equal(trial.columns["Force [N]"], np.tile(F, 2))
+    assert trial.begun == (len(T),)
     path.write_bytes(path.read_bytes()[:900])
     assert "not a sound workbook of Excel" in refused(path, ("Time [s]",))
 

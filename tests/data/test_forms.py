@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import scipy.io
 
+from bampipe.data.names import words
 from bampipe.data.quality.encoders import unwrapped
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.recording import describe_spans, read_recording
 from bampipe.data.session import Clock, TrialEntry
-from bampipe.data.survey import survey, words
+from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.setup.proposal import propose
 
@@ -38,19 +39,20 @@ PROPERTIES = (
     "Name\tq\tName\tu\nType\tREAL64\tType\tINT16\nUnit\tdeg\tUnit\tNm\nOffset\t0\tOffset\t0\n\n"
 )
 FORMS = {
-    "pairs": (lines("[info] t={t:.3f} q={q:.4f} u={u:.4f}", "Booting...\n"), ("t", "q", "u")),
-    "pairs of Python": (lines("{{'t': {t:.3f}, 'q': {q:.4f}, 'u': {u:.4f}}}"), ("t", "q", "u")),
+    "pairs": lines("[info] t={t:.3f} q={q:.4f} u={u:.4f}", "Booting...\n"),
+    "pairs of Python": lines("{{'t': {t:.3f}, 'q': {q:.4f}, 'u': {u:.4f}}}"),
     "unit cells": (lines("{t:.3f} s;{q:.4f}°;{u:.4f} Nm", "t;q;u\n"), ("t [s]", "q [°]", "u [Nm]")),
     "units in quotes": (
         lines('"{t:.3f} s","{q:.4f} deg","{u:.4f} Nm"', "t,q,u\n"), ("t [s]", "q [deg]", "u [Nm]")
     ),
-    "lists in cells": (lines('{t:.3f},"[{q:.4f}, {u:.4f}]"', "t,x\n"), ("t", "x[0]", "x[1]")),
-    "arrays in cells": (lines("{t:.3f},[ {q:.4f}  {u:.4f}]", "t,x\n"), ("t", "x[0]", "x[1]")),
-    "typeset minus": (
-        lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n").replace("-", "\u2212"), ("t", "q", "u")
+    "named lists": (
+        lines("{t:.3f},\"['q', 'u']\",\"({q:.4f}, {u:.4f})\"", "t,name,x\n"), ("t", "x.q", "x.u")
     ),
-    "Fortran": (lines("{t:.6E} {q:.6E} {u:.6E}", "t q u\n").replace("E", "D"), ("t", "q", "u")),
-    "rows with numbers": (lines('"{n}" {t:.3f} {q:.4f} {u:.4f}', '"t" "q" "u"\n'), ("t", "q", "u")),
+    "a matrix of MATLAB": lines("{t:.3f} {q:.4f} {u:.4f};", "[t q u\n") + "];\n",
+    "arrays in cells": (lines("{t:.3f},[ {q:.4f}  {u:.4f}]", "t,x\n"), ("t", "x[0]", "x[1]")),
+    "typeset minus": lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n").replace("-", "\u2212"),
+    "Fortran": lines("{t:.6E} {q:.6E} {u:.6E}", "t q u\n").replace("E", "D"),
+    "rows with numbers": lines('"{n}" {t:.3f} {q:.4f} {u:.4f}', '"t" "q" "u"\n'),
     "groups above names": (
         lines("{t:.3f},{q:.4f},{t:.3f},{u:.4f}", "Arm,,Cell,\nt,x,t,x\n"),
         ("Arm t", "Arm x", "Cell x"),
@@ -63,9 +65,8 @@ FORMS = {
         lines("{t:.3f}\t{q:.4f}\t{t:.3f}\t{u:.4f}", f"Scope\n\n{PROPERTIES}"),
         ("Time (1)", "q", "u"),
     ),
-    "properties with colons": (
-        lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n,Type: a,Type: b\ns,Units: rad,Units: N*m\n"),
-        ("t", "q", "u"),
+    "properties with colons": lines(
+        "{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n,Type: a,Type: b\ns,Units: rad,Units: N*m\n"
     ),
     "keys once a line": (
         lines(
@@ -78,8 +79,8 @@ FORMS = {
         lines("  {t:.3f}  {q:.4f}  {u:.4f}", "  time s   POS (ANAT)   u\n ------------------\n"),
         ("time s", "POS (ANAT)", "u"),
     ),
-    "apostrophes": (lines("1'00{t:.3f};{q:.4f};{u:.4f}", "t;q;u\n"), ("t", "q", "u")),
-    "line protocol": (lines("arm,id=a t={t:.3f},q={q:.4f},u={u:.4f} 1790000000"), ("t", "q", "u")),
+    "apostrophes": lines("1'00{t:.3f};{q:.4f};{u:.4f}", "t;q;u\n"),
+    "line protocol": lines("arm,id=a t={t:.3f},q={q:.4f},u={u:.4f} 1790000000"),
     "lines of XML": (
         lines('<R><T>{t:.3f}</T><P A1="{q:.4f}"/><M A1="{u:.4f}"/></R>'), ("T", "P.A1", "M.A1")
     ),
@@ -87,26 +88,23 @@ FORMS = {
         lines("{t:.3f},{q:.4f},{u:.4f},1", ",a,b,b\n,x,x,y\nt,,,\n"), ("t", "a x", "b x")
     ),
     "an index without a name": (lines("{t:.3f},{q:.4f},{u:.4f}", ",q,u\n"), ("time", "q", "u")),
-    "remarks among samples": (
-        lines("{t:.3f} {q:.4f} {u:.4f}", "# t q u\n# trial 1\n") + "# trial 2\n", ("t", "q", "u")
-    ),
+    "remarks among samples": lines("{t:.3f} {q:.4f} {u:.4f}", "# t q u\n# trial 1\n") + "# 2\n",
     "a first row with holes": (
-        "t,q,u,note\n" + lines("{t:.3f},{q:.4f},{u:.4f},").replace("1.0000,", ",start", 1),
-        ("t", "q", "u"),
+        "t,q,u,note\n" + lines("{t:.3f},{q:.4f},{u:.4f},").replace("1.0000,", ",start", 1)
     ),
     "names of two lines in quotes": (
         lines("{t:.3f},{q:.4f},{u:.4f}", '"t\r\n[s]",q,"u\n\n(Nm)"\n'), ("t [s]", "q", "u (Nm)")
     ),
     "a summary at the end": (
-        lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n") + "\n# 60 rows\nLargest,0.99,\nOverruns: 0\n",
-        ("t", "q", "u"),
+        lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n") + "\n# 60 rows\nLargest,0.99,\nOverruns: 0\n"
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FORMS)
 def test_texts_that_are_no_plain_tables(tmp_path: Path, name: str):
-    text, columns = FORMS[name]
+    form = FORMS[name]
+    text, columns = form if isinstance(form, tuple) else (form, ("t", "q", "u"))
     path = tmp_path / "a.txt"
     path.write_text(text)
     assert set(columns) <= set(columns_of(path))
@@ -127,7 +125,7 @@ def test_units_of_properties_are_heard(tmp_path: Path):
             FORMS["properties of channels"][0],
             {"Time (1)": "", "q": "deg", "Time (2)": "", "u": "Nm"},
         ),
-        (FORMS["properties with colons"][0], {"t": "s", "q": "rad", "u": "N*m"}),
+        (FORMS["properties with colons"], {"t": "s", "q": "rad", "u": "N*m"}),
         (rate, {"t": "s", "q": "°", "u": "Nm"}),
         (
             lines("{t:.3f};{t:.3f};{q:.4f}", "path;Root/t;Root/q\nunit;s;rad\ntrace_values;;\n"),
@@ -174,13 +172,13 @@ def test_signals_in_rows_of_their_own_are_put_beside_one_another(tmp_path: Path)
     np.testing.assert_allclose(raw.columns["u"][k], k, atol=1e-9)
     assert not {*range(202, 229)} & {*k} and len(k) > 560
     assert "'u' stands in rows of its own: interpolated linearly at the ti" in raw.remarks[-1]
-    long = ["time,signal,value"]
+    long = ["joint,time,q,u"]
     for k in range(200):
-        long += [f"{0.01 * k:.3f},q,{k}", f"{0.01 * k:.3f},u,{2 * k}"]
+        long += [f"a,{0.01 * k:.3f},{k},1", f"b,{0.01 * k:.3f},{2 * k},2"]
     (tmp_path / "b.csv").write_text("\n".join(long) + "\n")
     entry, clock = TrialEntry(file="b.csv", kind="free"), Clock(column="time", unit="s")
-    raw = read_recording(tmp_path, entry, ("time", "q", "u"), clock)
-    np.testing.assert_allclose(raw.columns["u"], 2.0 * raw.columns["q"])
+    raw = read_recording(tmp_path, entry, ("time", "a.q", "b.q"), clock)
+    np.testing.assert_allclose(raw.columns["b.q"], 2.0 * raw.columns["a.q"])
 
 
 @pytest.mark.parametrize(
@@ -205,7 +203,7 @@ def test_dates_as_people_write_them(tmp_path: Path, form: str):
         ("Sollposition [°]", ["soll", "position"]), ("Motorstrom", ["motor", "strom"]),
         ("angle mesuré", ["angle", "mesure"]), ("posición", ["posicion"]), ("q_des", ["q", "des"]),
         ("qdes", ["q", "des"]), ("关节角速度(deg/s)", ["velocity"]), ("トルク[Nm]", ["torque"]),
-        ("rate", ["rate"]), ("timestamp", ["timestamp"]), ("ActPos", ["act", "pos"]),
+        ("rate", ["rate"]), ("timestamp", ["timestamp"]), ("AIActPos", ["ai", "act", "pos"]),
     ],
 )  # fmt: skip
 def test_words_of_names_in_other_languages(name: str, said: list[str]):
@@ -226,8 +224,9 @@ def test_encodings_of_chinese_and_japanese(tmp_path: Path, encoding: str, time: 
 def test_units_are_heard_wherever_they_stand_in_a_name(tmp_path: Path):
     units = {
         "Kraft in N": "N", "force_mN_raw": "mN", "torque_in_lbs": "in.lbs", "push_gf": "gf",
-        "pos_0.1mm": "0.1mm", "Winkel / °": "°", "pos µm": "um",
+        "pos_0.1mm": "0.1mm", "Winkel / °": "°", "pos µm": "um", "push": "N mm",
     }  # fmt: skip
+    (tmp_path / "README.md").write_text("- push: N mm, of the hand\n- pos: 3\n")
     write(tmp_path / "a.csv", ",".join(["t_s", *units]), T, *[Q] * len(units))
     assert {c.name: c.unit for c in survey(tmp_path).columns} == {"t_s": "s", **units}
 
@@ -363,7 +362,7 @@ def test_trials_in_one_file_are_told_apart(tmp_path: Path):
     t, u = np.arange(400) / 100.0, np.cos(np.arange(400) / 50.0)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for n in (1, 2, 3):
-            for name, values in (("t", t), ("q", np.sin(n * t)), ("u", u)):
+            for name, values in (("t", t), ("q", np.sin(n * t)), ("u", u), ("pair", np.c_[u, t])):
                 file[f"trial_{n:02d}/{name}"] = values
     assert [trial.recording for trial in survey(tmp_path).trials] == [1, 2, 3]
     (tmp_path / "a.h5").unlink()
@@ -502,7 +501,7 @@ def test_logs_with_their_time_come_first_and_unnamed_columns_are_alike_in_number
     write(tmp_path / "b/b.csv", "", Q[:20], U[:20])
     found = survey(tmp_path / "b")
     assert [trial.file for trial in found.trials] == ["a.csv"] and len(found.columns) == 3
-    assert found.passed == (("b.csv", "other columns, for another session"),)
+    assert found.passed == (("b.csv", "other columns, for another session, without column_3"),)
 
 
 def test_speeds_in_hertz_commands_and_one_reading_in_two_units(tmp_path):

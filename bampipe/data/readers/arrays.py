@@ -17,10 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.readers import moments
+from bampipe.data.readers import moments, trial
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
 from bampipe.data.units import SCALES, in_steps, units_beside
 from bampipe.errors import InputError, located
+from bampipe.lists import join_names
 
 LARGEST_WIDTH = 64
 _RUN = re.compile(
@@ -81,7 +82,8 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
     arrays = _in_steps(arrays)
     units = {name: array.unit for name, array in arrays.items() if array.kind == STATED}
     arrays = {name: array for name, array in arrays.items() if name not in units}
-    joined, begun = _join_runs(arrays)
+    at_one_rate = _at_one_rate(arrays)
+    joined, begun = _join_runs(at_one_rate)
     known: Arrays = {**arrays, **joined}
     values = dict[str, np.ndarray]()
     for column in wanted.columns:
@@ -93,8 +95,12 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
         with located(f"{what} '{column}'"):
             values[column] = _read_column(array, index, wanted.datetimes.get(column))
         units |= {column: array.unit} if array.unit else {}
-    starts = next((begun[column] for column in wanted.columns if column in begun), ())
-    return RawTrial(aligned(values, what), first_row=1, units=units, begun=starts)
+    called = (split_index(column, known)[0] for column in wanted.columns)
+    starts = next((begun[name] for name in called if name in begun), ())
+    own = [c for c in wanted.columns if at_one_rate.get(c) is not arrays.get(c)]
+    said = f"interpolated linearly at the times of the longest: {join_names(own)}"
+    remarks = (said,) if own else ()
+    return RawTrial(aligned(values, what), 1, remarks=remarks, units=units, begun=starts)
 
 
 def _read_column(array: Stored, index: int | None, form: str | None) -> np.ndarray:
@@ -137,7 +143,7 @@ def columns_of_arrays(arrays: Arrays) -> dict[str, str]:
     And of numbers that stand alone. Beside a log a file may keep what belongs to no sample: gains
     by axis, a table of settings.
     """
-    joined = _join_runs(_in_steps(arrays))[0]
+    joined = _join_runs(_at_one_rate(_in_steps(arrays)))[0]
     found = {name: array for name, array in joined.items() if array.kind in _NUMBERS + "M"}
     by_length: dict[int, list[str]] = {}
     for name, array in found.items():
@@ -257,6 +263,45 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [f"{name}[{k}]" for k in range(min(sides))] if min(sides) <= LARGEST_WIDTH else []
 
 
+def _at_one_rate(arrays: Arrays) -> Arrays:
+    """The arrays, those of signals with fewer samples between theirs at the times of the longest.
+
+    Of groups that each have a time, and one signal or others than the rest; else they are trials.
+    """
+    groups: dict[str, dict[str, Stored]] = {}
+    for name, array in arrays.items():
+        owner, dot, key = name.rpartition("/" if "/" in name else ".")
+        sampled = array.kind in _NUMBERS and max(array.shape, default=1) > 1
+        if dot and sampled and not _RUN.fullmatch(name):
+            groups.setdefault(owner + dot, {})[key] = array
+    clocks = {
+        own: key for own, keys in groups.items() if (key := next(filter(_CLOCK.match, keys), ""))
+    }
+    kinds = [frozenset(groups[own]) for own in clocks]
+    if len(clocks) < 2 or (len({*kinds}) < len(kinds) and max(map(len, kinds)) > 2):
+        return arrays
+    longest = max(
+        (groups[own][key] for own, key in clocks.items()), key=lambda x: math.prod(x.shape)
+    )
+    found = dict(arrays)
+    for own, key in clocks.items():
+        times = groups[own].pop(key)
+        if times.shape != longest.shape and groups[own]:
+            del found[own + key]
+            for name, array in groups[own].items():
+                width = array.shape[1:] if array.shape != times.shape else longest.shape[1:]
+                load = partial(_resampled, longest, times, array)
+                shape = (*longest.shape[:1], *width)
+                found[own + name] = replace(array, shape=shape, load=load)
+    return found
+
+
+def _resampled(at: Stored, times: Stored, values: Stored) -> np.ndarray:
+    t, own = (array.load().astype(float).ravel() for array in (at, times))
+    columns = values.load().astype(float).reshape(own.size, -1).T
+    return np.column_stack([trial.interpolated(t, own, column) for column in columns])
+
+
 def _join_runs(arrays: Arrays) -> tuple[dict[str, Stored], dict[str, tuple[int, ...]]]:
     """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
 
@@ -269,24 +314,29 @@ def _join_runs(arrays: Arrays) -> tuple[dict[str, Stored], dict[str, tuple[int, 
     runs: dict[str, dict[str, str]] = {}
     for label, array in found.items():
         match = _RUN.fullmatch(label)
-        if match and len(labels("", array.shape)) == 1 < math.prod(array.shape):
-            runs.setdefault(f"{match[1]}[:].{match[4]}", {})[match[2] or match[3]] = label
+        if match and labels("", array.shape) and math.prod(array.shape) > 1:
+            runs.setdefault(f"{match[1]}[:].{match[4]}", {})[match[3] or f"[{match[2]}]"] = label
     timed = {name.partition("[")[0]: list(own) for name, own in runs.items() if _TIMES.search(name)}
     for name, own in runs.items():
         parts = [found[label] for label in own.values()]
         sizes = [math.prod(part.shape) for part in parts]
         times = timed.get(name.partition("[")[0])
-        alike = len(set(sizes)) == 1 and times is None
-        if alike or len(own) < 2 or list(own) != (times or list(own)):
+        # Groups that are called trials are no joints, whatever their lengths.
+        alike = len(set(sizes)) == 1 and times is None and not all(map(str.isdigit, own))
+        widths = {len(labels("", part.shape)) for part in parts}
+        if alike or len(widths) > 1 or len(own) < 2 or list(own) != (times or list(own)):
             continue
         found = {label: array for label, array in found.items() if label not in own.values()}
-        found[name] = replace(parts[0], shape=(sum(sizes),), load=partial(_end_to_end, parts))
-        begun[name] = tuple(accumulate(sizes[:-1]))
+        width = widths.pop()
+        shape = (sum(sizes) // width, *([width] if width > 1 else []))
+        found[name] = replace(parts[0], shape=shape, load=partial(_end_to_end, parts, shape))
+        begun[name] = tuple(accumulate(size // width for size in sizes[:-1]))
     return found, begun
 
 
-def _end_to_end(parts: Iterable[Stored]) -> np.ndarray:
-    return np.concatenate([part.load().ravel() for part in parts])
+def _end_to_end(parts: Iterable[Stored], shape: tuple[int, ...]) -> np.ndarray:
+    tables = (part.load().reshape(-1, *shape[1:]) for part in parts)
+    return np.concatenate([*tables])
 
 
 @dataclass(frozen=True)
@@ -327,17 +377,27 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     found: dict[str, Stored] = {}
     units = units_beside({x: str(a.ravel()[0]) for x, a in whole.items() if a.size == 1})
     for key, array in whole.items():
-        fields = array.dtype.names
-        parts = {f"{key}.{part}": array[part] for part in fields} if fields else {key: array}
-        found |= {n: stored(np.atleast_1d(x), units.get(n, "")) for n, x in parts.items()}
-    blocks = [(name, array.shape) for name, array in found.items() if len(array.shape) > 2]
-    if wanted is None and blocks and len(blocks) == len(found):
+        parts = _fields(key, array)
+        found |= {n: stored(np.atleast_1d(x), units.get(n, "")) for n, x in parts}
+    sampled = [array.shape for array in found.values() if math.prod(array.shape) > LARGEST_WIDTH]
+    blocks = [
+        (name, array.shape) for name, array in found.items() if len(labels("", array.shape)) == 0
+    ]
+    if wanted is None and blocks and len(blocks) == len(sampled):
         name, shape = blocks[0]
         raise InputError(
             f"'{name}' is a {_by(shape)} array, of which no side is said to be the samples",
             remedy="save each trial as an array of its own, samples by channels",
         )
     yield found, ()
+
+
+def _fields(name: str, array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """An array of numbers itself; of records, what is in them."""
+    if array.dtype.names is None:
+        yield name, array
+    for field in array.dtype.names or ():
+        yield from _fields(f"{name}.{field}", array[field])
 
 
 READER = ArrayReader("array", _opened)

@@ -112,7 +112,8 @@ def cells(text: str, delimiter: str) -> list[str]:
     """The cells of one line, without the blanks around them."""
     if delimiter == " ":
         return text.split()
-    return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter), [])]
+    row = next(csv.reader([text.replace("\r", " ")], delimiter=delimiter), [])
+    return [cell.strip() for cell in row]
 
 
 def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableLayout:
@@ -133,6 +134,10 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     # Not the joint whose name was put in brackets.
     units = {h: u for h, u in units_in(header).items() if dialect.names or u in named}
     units |= _units_of_motion([line.text for line in lines[:index]], header)
+    for line in lines[: max(index, 0)]:
+        row = cells(line.text, delimiter)
+        if len(row) == len(header) and re.search(r"(?i)\bunits?:?\Z", row[0]):
+            units = {h: u for h, u in zip(header[1:], row[1:], strict=True) if u} | units
     remarks, scales = [], dict[str, float]()
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
@@ -306,8 +311,16 @@ def _trimmed(row: list[str], width: int) -> list[str]:
 def _otherwise(text: str, width: int) -> list[list[str]]:
     """The names in a header of ``width`` cells, by each delimiter that separates so many."""
     plain = _REMARK.sub("", text, count=1).strip()
-    split = [cells(plain, delimiter) for delimiter in DELIMITERS] + [re.split(r"\s{2,}", plain)]
+    split = [cells(plain, delimiter) for delimiter in DELIMITERS]
+    split += [re.split(r"\s{2,}", plain), re.split(r"\s+(?![\[(])", plain)]
+    split += [[item for name in plain.split() for item in _counted(name)]]
     return [row for row in split if len(row) == width > 1]
+
+
+def _counted(name: str) -> list[str]:
+    """The names of as many columns as a name says behind it: ``q[2]`` is q[0] and q[1]."""
+    match = re.fullmatch(r"(\S+)\[(\d{1,2})\]", name)
+    return [f"{match[1]}[{k}]" for k in range(int(match[2]))] if match else [name]
 
 
 def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> list[str]:
@@ -330,6 +343,10 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
         groups = cells(above[-2].text, delimiter) if apart and len(above) > 1 else []
         groups = groups if len(groups) == len(row) else [""] * len(row)
         row = [a or f"{g} {b}".strip() for a, b, g in zip(row, beside, groups, strict=True)]
+    if beside and len(beside) == len(row) and re.match(r"(?i)labels?\b", beside[0]):
+        row = [
+            f"{name} {label}".strip() for name, label in zip(row, ["", *beside[1:]], strict=True)
+        ]
     if _is_key_of_names(row):
         row = ["Time" if name == row[0] else name for name in row]
     row = _named_items(row, rows, delimiter)
@@ -396,6 +413,9 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
     for _, width, delimiter in (each for each in ranked if each[0] >= _ALIKE * best):
         split = [cells(line.text, delimiter) for line in lines]
         numbers = [_number_cells(row, delimiter) if len(row) == width else 0 for row in split]
+        worded = [re.match(r"[^\W\d_]", row[0]) is not None if row else False for row in split]
+        if 2 * sum(worded) < len(split):  # where samples begin with a number
+            numbers = [0 if word else n for n, word in zip(numbers, worded, strict=True)]
         samples = [
             [n for n, row in enumerate(split) if numbers[n] > 0.5 * of(row)]
             for of in (len, lambda row: sum(map(bool, row)))  # of cells, or of those with something
@@ -431,13 +451,17 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
     width, above = len(cells(lines[first].text, delimiter)), _filled(lines[:first])[-4:]
     bare = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above}
     rows = {n: _trimmed(row, width) for n, row in bare.items()}
-    for n, row in rows.items():
+    for n in above[-2:]:
+        row = rows[n]
         if not width - 1 <= len(row) <= width:
             rows[n] = next(iter(_otherwise(lines[n].text, width)), row)
+    # Below the names stands nothing with fewer cells: that is what a logger says as it starts.
+    apart = [n for n, row in rows.items() if len(row) < width - 1 and not _is_remark(lines[n].text)]
     fitting = [
         n
         for n, row in rows.items()
         if width - 1 <= len(row) <= width
+        and n > max(apart, default=-1)
         and not all(map(_POINT.match, row))
         and all(any(map(str.isalnum, cell)) for cell in row if cell)
     ]
@@ -447,9 +471,8 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
         fitting.pop()
     for n in reversed(_filled(lines[:first])):
         row = cells(lines[n].text, delimiter)
-        if len(row) != width:
-            break
-        if _is_key_of_names(row):
+        begun = not cells(lines[first].text, delimiter)[0] and re.search(r"(?i)names?:?\Z", row[0])
+        if len(row) == width and (begun or _is_key_of_names(row)):
             return n
     wordy = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
     if wordy and wordy[-1] != fitting[-1]:
@@ -531,7 +554,7 @@ def _of_properties(row: list[str]) -> tuple[list[str], bool]:
     if len(keys) >= 0.5 * len(said) > 0:
         return [re.sub(r"^[A-Za-z ]+:\s+", "", cell) for cell in row], True
     key = row[0] if row else ""
-    listed = re.match(r"[A-Za-z]{3}", key) is not None and key.lower() not in ("sec", "rad", "deg")
+    listed = re.match(r"[^\W\d_]{3}", key) is not None and key.lower() not in ("sec", "rad", "deg")
     alone = row.count(key) > 1 or unit(key) is None
     if not (listed and alone):
         return row, False

@@ -5,7 +5,7 @@ or a column of a matrix (``log/pose[2]``). What lies outside the file is not fol
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,8 +49,9 @@ def numbers_of(path: Path) -> dict[str, float]:
     """Single numbers in the attributes of a file and of what is in it, by their names."""
     import h5py
 
-    with h5py.File(path, "r") as file:
-        found = dict(file.attrs)
+    found: dict[str, Any] = {}
+    with h5py.File(path, "r") as file, suppress(RuntimeError):  # where a group is damaged
+        found |= file.attrs
         file.visititems(
             lambda label, item: found.update({f"{label}.{k}": v for k, v in item.attrs.items()})
         )

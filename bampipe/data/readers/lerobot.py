@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from bampipe.data.readers.arrays import LARGEST_WIDTH
 from bampipe.errors import InputError
 from bampipe.files import read_json_table
 
@@ -117,7 +118,7 @@ def vector_columns(path: Path, schema: pa.Schema) -> dict[str, tuple[str, int]]:
             batch = next(first.iter_batches(1, columns=[field.name]))
             size = len(batch.column(0)[0].as_py() or ())
         names = [f".{name}" for name in named] if len({*named}) == len(named) == size else []
-        for place in range(size):
+        for place in range(size if size <= LARGEST_WIDTH else 0):  # else a trial in each
             found[field.name + (names[place] if names else f"[{place}]")] = (field.name, place)
     return found
 

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from pyarrow import dataset
 
 from bampipe.data.readers import lerobot, moments
-from bampipe.data.readers.arrays import ArrayReader, Opened, Stored
+from bampipe.data.readers.arrays import LARGEST_WIDTH, ArrayReader, Opened, Stored
 from bampipe.data.readers.nested import leaves
 from bampipe.data.readers.trial import NUMBER, RawTrial, Wanted
 from bampipe.data.units import SCALES, in_steps, units_beside
@@ -56,8 +56,17 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         if size := [float(text) for text in sizes if re.fullmatch(NUMBER, text)]:
             said = in_steps(load(), size, said)
         found[field.name] = Stored((rows,), kind, load, said)
-    for name, (vector, place) in lerobot.vector_columns(path, schema).items():
+    vectors = lerobot.vector_columns(path, schema)
+    for name, (vector, place) in vectors.items():
         found[name] = Stored((rows,), "f", partial(_cells, read_column, vector, place))
+    taken = {vector for vector, _ in vectors.values()}
+    for field in schema if rows <= LARGEST_WIDTH else ():  # a trial a row
+        numbers = pa.types.is_list(field.type) and _KINDS["f"][:2]
+        if numbers and field.name not in taken and any(x(field.type.value_type) for x in numbers):
+            cells = read_column(field.name).cast(pa.list_(pa.float64()))
+            for k, size in enumerate(pc.list_value_length(cells).to_pylist()):
+                load = partial(_values_of_row, cells, k)
+                found[f"trial{k}.{field.name}"] = Stored((size,), "f", load)
     yield found, ()
 
 
@@ -66,7 +75,8 @@ READER = ArrayReader("column", _opened)
 
 def read(path: Path, wanted: Wanted) -> RawTrial:
     """The wanted columns; `InputError` as `read_arrays`, or where the file is damaged."""
-    return replace(READER.read(path, wanted), begun=lerobot.episodes_begin(path))
+    trial = READER.read(path, wanted)
+    return replace(trial, begun=trial.begun or lerobot.episodes_begin(path))
 
 
 def columns(path: Path) -> dict[str, str]:
@@ -74,6 +84,10 @@ def columns(path: Path) -> dict[str, str]:
     found = READER.columns(path)
     numbers = lerobot.NO_READINGS if lerobot.EPISODE in found else ()
     return {name: unit for name, unit in found.items() if name not in numbers}
+
+
+def _values_of_row(cells: pa.ChunkedArray, row: int) -> np.ndarray:
+    return np.asarray(cells[row].values.to_numpy(zero_copy_only=False))
 
 
 def _cells(

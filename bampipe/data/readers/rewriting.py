@@ -15,6 +15,7 @@ from bampipe.data.readers.dialect import cells
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER
 from bampipe.data.units import unit
+from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError
 
 _PAIR = re.compile(rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*({NUMBER})(?![\w.:])""")
@@ -37,30 +38,6 @@ PUT_BEFORE = "export with the minus before the number, not behind it and not as 
 _GROUPS = ((",", r"\."), (".", ","), (" ", "[.,]"), ("'", "[.,]"), ("’", "[.,]"))
 """Signs between thousands, and what may stand before the decimals then."""
 _BROKEN = re.compile(r'(?<![^\n,;\t])"[^",;\t\r\n]*(?:[\r\n]+[^",;\t\r\n]*){1,3}"(?![^\r\n,;\t])')
-_BYTE = "[,;\t](0x)?[0-9A-Fa-f]{2}"
-_CAN = "frames of a CAN bus, whose bytes mean nothing without their data base (DBC)"
-_DECODE = "decode them, for example with `cantools`, `asammdf` or the logger, to a CSV of signals"
-_PIVOT = (
-    "make it a column a signal: frame.pivot(index=TIME, columns=SIGNAL, values=VALUE) in pandas,"
-    ' |> pivot(rowKey: ["_time"], columnKey: ["_field"], valueColumn: "_value") in Flux'
-)
-_FOREIGN = (
-    (re.compile(rf"\d+\.\d+[,;\t]\w+[,;\t][1-8](?=.*[A-Fa-f])({_BYTE}){{1,8}}\Z"), _CAN, _DECODE),
-    (re.compile(r"\s*\(\d+\.\d+\)\s+\w+\s+[0-9A-F]+#"), _CAN, _DECODE),
-    (re.compile(r"\s*(\(\S+\)\s+)?\w+\s+[0-9A-F]{3,8}\s+\[\d+\]\s"), _CAN, _DECODE),
-    (re.compile(r"\s*\d+\.\d+\s+\d+\s+[0-9A-Fa-f]+x?\s+[RT]x\s+d "), _CAN, _DECODE),
-    (
-        re.compile(r"# name: \w+"),
-        "variables one below the other, as Octave writes them",
-        "save them with: save -v7 FILE.mat",
-    ),
-    (
-        re.compile(r"(?i)(?=.*\b_?(?:field|variable|signal|channel|parameter)\b)(?=.*\b_?value\b)"),
-        "a reading a row, one signal below the other",
-        _PIVOT,
-    ),
-)
-"""Lines of texts that are no table of samples, what they are, and what to do."""
 _TYPESET = {"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2009": " "}
 """Minus and blanks of typesetters."""
 _MOST = 0.8
@@ -115,6 +92,8 @@ def find_form(head: str) -> Form | None:
     ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
     if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
         return Form("", lambda line: line.removesuffix(";"))
+    if re.fullmatch(r"[^\[]*\]\s*;?\s*", lines[-1]):  # of a matrix of MATLAB
+        return Form("", lambda line: re.sub(r"^\s*\[|[\s;]*\]?[\s;]*$", "", line))
     if _are(_STAMPED, lines):
         return _stamped(lines)
     for kind, form in _ALIKE.items():
@@ -138,9 +117,9 @@ def find_form(head: str) -> Form | None:
         if found:
             return found
     for line in (*whole[:_FEWEST], lines[-1]):
-        for pattern, what, remedy in _FOREIGN:
-            if pattern.match(line):
-                raise InputError(what, remedy=remedy)
+        for kind in VOCABULARY["no_tables"]:
+            if any(re.match(pattern, line) for pattern in kind["lines"]):
+                raise InputError(kind["what"], remedy=kind["remedy"])
     return None
 
 
@@ -259,26 +238,39 @@ def _cells(header: list[str], rows: list[list[str]], delimiter: str) -> Form | N
     if any(units):
         return Form("numbers with their units", _by_cell(delimiter, units, _without_unit))
     if any(widths):
-        return Form("cells that are lists", _by_cell(delimiter, widths, _unpacked))
-    signals = Counter(row[1] for row in rows if row != header)
-    numbers = sum(bool(re.fullmatch(NUMBER, row[-1])) for row in rows)
-    in_turn = sum(one[1] != other[1] for one, other in pairwise(rows))
-    if (
-        len(header) == 3
-        and 1 < len(signals) <= _MOST_SIGNALS
-        and min(signals.values()) >= _FEWEST
-        and all(re.match(r"[^\W\d_]", name) for name in signals)
-        and min(numbers, 2 * in_turn) > _MOST * len(rows)
-    ):
-        names = list(signals)
-
-        def rewrite(line: str) -> str:
-            row = cells(line, delimiter)
-            own = [row[2] if row[1] == name else "" for name in names] if len(row) == 3 else []
-            return delimiter.join([row[0], *(names if row == header else own)] if own else row)
-
-        return Form(f"a reading a row, of {', '.join(names)} in turn", rewrite)
+        return Form(
+            "cells that are lists", _by_cell(delimiter, _named_lists(rows, widths), _unpacked)
+        )
+    for at in range(min(2, len(header) - 1)):
+        names = Counter(row[at] for row in rows if row != header)
+        numbers = sum(all(re.fullmatch(NUMBER, x) for x in row[2:]) for row in rows)
+        in_turn = sum(one[at] != other[at] for one, other in pairwise(rows))
+        if (
+            1 < len(names) <= _MOST_SIGNALS
+            and min(names.values()) >= _FEWEST
+            and all(re.match(r"[^\W\d_]", name) for name in names)
+            and min(numbers, 2 * in_turn) > _MOST * len(rows)
+        ):
+            return _in_turn(header, list(names), at, delimiter)
     return None
+
+
+def _in_turn(header: list[str], names: list[str], at: int, delimiter: str) -> Form:
+    """The form of a table whose cells ``at`` name the signal or the joint that a row is of."""
+
+    def rewrite(line: str) -> str:
+        row = cells(line, delimiter)
+        if len(row) != len(header):
+            return line
+        time, own, values = row[1 - at], row[at], row[2:]
+        if row == header:
+            alone = len(values) == 1
+            return delimiter.join(
+                [time, *(n if alone else f"{n}.{x}" for x in values for n in names)]
+            )
+        return delimiter.join([time, *(x if n == own else "" for x in values for n in names)])
+
+    return Form(f"a reading a row, of {', '.join(names)} in turn", rewrite)
 
 
 def _by_cell(
@@ -289,7 +281,8 @@ def _by_cell(
         if len(row) != len(of):
             return line
         pairs = zip(row, of, strict=True)
-        return delimiter.join(x for cell, own in pairs for x in (act(cell, own) if own else [cell]))
+        plain = [x for cell, own in pairs for x in (act(cell, own) if own else [cell])]
+        return delimiter.join(f'"{x}"' if delimiter in x else x for x in plain)
 
     return rewrite
 
@@ -301,9 +294,19 @@ def _without_unit(cell: str, end: str) -> list[str]:
     return [f"{cell} [{end}]" if cell and not re.search(r"\d", cell) else cell]  # of the header
 
 
-def _unpacked(cell: str, width: int) -> list[str]:
+def _named_lists(rows: list[list[str]], widths: Sequence[int]) -> list[list[str]]:
+    """What items of cells that are lists are called: by a list of names, or by number.
+
+    Nothing of other cells.
+    """
+    words = (re.findall(r"[^\W\d][\w/]*", cell) for cell in rows[0] if cell[:1] in "[(")
+    names = {len(own): [f".{x}" for x in own] for own in words if own}
+    return [names.get(width, [f"[{k}]" for k in range(width)]) for width in widths]
+
+
+def _unpacked(cell: str, names: Sequence[str]) -> list[str]:
     items = _items(cell)
-    return items if len(items) == width else [f"{cell}[{k}]" if cell else "" for k in range(width)]
+    return items if len(items) == len(names) else [f"{cell}{x}" if cell else "" for x in names]
 
 
 def _items(cell: str) -> list[str]:

@@ -62,8 +62,7 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
 
 def columns(path: Path, dialect: Dialect | None = None) -> dict[str, str]:
     """Names and units of the columns of numbers, or of moments (unit "datetime")."""
-    with _opened(path, dialect or Dialect()) as (stream, dialect, _):
-        head = _head(stream)
+    head, dialect = _rewritten_head(path, dialect or Dialect())
     if dialects.share_of_rows(head) < _LEAST_ROWS:
         return {}
     layout = dialects.find_layout(head, (), dialect)
@@ -79,8 +78,7 @@ def above_samples(path: Path) -> str:
     Raises:
         InputError: it is none.
     """
-    with _opened(path, Dialect()) as (stream, dialect, _):
-        head = _head(stream)
+    head, dialect = _rewritten_head(path, Dialect())
     if dialects.share_of_rows(head) < _LEAST_ROWS:
         raise InputError("not a table")
     start = dialects.find_layout(head, (), dialect).start
@@ -90,10 +88,16 @@ def above_samples(path: Path) -> str:
 def is_table(path: Path) -> bool:
     """Whether a file of an unknown extension is text with rows of numbers."""
     try:
-        with path.open("rb") as stream:
-            return dialects.share_of_rows(_head(stream)) > _MANY_ROWS
+        with path.open("rb") as file:
+            _head(file)
+        return dialects.share_of_rows(_rewritten_head(path, Dialect())[0]) > _MANY_ROWS
     except (OSError, InputError):
         return False
+
+
+def _rewritten_head(path: Path, dialect: Dialect) -> tuple[bytes, Dialect]:
+    with _opened(path, dialect) as (stream, dialect, _):
+        return _head(stream), dialect
 
 
 @contextmanager
@@ -138,12 +142,18 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
 
 
 def _sheet(file: BinaryIO) -> BinaryIO:
-    """The sheet of a workbook that has most rows, as CSV; InputError without openpyxl."""
+    """The sheets of a workbook that have the header of the longest, as CSV, one below the other.
+
+    InputError without openpyxl.
+    """
     book = need("openpyxl", "xlsx").load_workbook(file, read_only=True, data_only=True)
-    sheets = ([*sheet.iter_rows(values_only=True)] for sheet in book.worksheets)
-    rows = max(sheets, key=len, default=[])
+    sheets = [[*sheet.iter_rows(values_only=True)] for sheet in book.worksheets]
+    longest = max(sheets, key=len, default=[])
+    named = [row for row in longest if sum(isinstance(cell, str) for cell in row) > 1][:1]
     text = io.StringIO(newline="")
-    csv.writer(text).writerows(rows)
+    for rows in sheets if named else [longest]:
+        if rows is longest or named[0] in rows:
+            csv.writer(text).writerows(rows)
     return io.BytesIO(text.getvalue().encode())
 
 

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.names import DRIVERS, words
 from bampipe.data.readers import lerobot
-from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, survey, words
+from bampipe.data.survey import Survey, SurveyedColumn, survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.lists import join_names
@@ -25,7 +26,7 @@ from bampipe.setup.mounting import Mounting
 from bampipe.setup.proposal import device as devices
 from bampipe.setup.proposal.device import DEVICE, UNKNOWN_CONSTANT, ChosenDevice, with_motors
 from bampipe.setup.proposal.matching import Matcher
-from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted, sentence
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import RobotColumns, find_robot_columns
 from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
@@ -103,18 +104,12 @@ def propose(
     inputs = input_tables(chosen.device, axes, match)
     if len(match.rivals) > 1 and match.axes == 1:
         measured = join_names(column.name for column in axes.values())
-        notes.check.append(
-            f"of {join_names(match.rivals, 6)}, {measured} is the measured position; if these are a"
-            " robot's, put its URDF beside the logs; if other trials', say so by columns in"
-            " [[trials]]"
-        )
+        several = join_names(match.rivals, 6)
+        notes.check.append(sentence("rivals", several=several, measured=measured))
     left = [column.name for column in found.columns if column.name not in match.used]
     beside = [c.name for c in found.of("force") if c.name in left and not c.is_constant]
     if beside and match.axes == 1 and len(match.rivals) < 2:
-        notes.check.append(
-            f"{join_names(beside, 4)} may act on the axis, too, and is not used: if so, log the sum"
-            " of all that do, with their signs, in one column"
-        )
+        notes.check.append(sentence("may_act", names=join_names(beside, 4)))
     passed: dict[str, list[str]] = {}
     for name, reason in found.passed:
         passed.setdefault(reason.removeprefix(name).lstrip(":, "), []).append(name)
@@ -203,10 +198,7 @@ def _hang(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) 
     gravity = np.where(np.abs(mounting.gravity) < 1e-9, 0.0, mounting.gravity)
     said = f"gravity = [{', '.join(f'{v:.4g}' for v in gravity)}]"
     put = "" if chosen.text else f" put that into [robot] of {chosen.name}"
-    notes.check.append(
-        f"{said} in the frame of the base, by weight and inertia as drawn: is the robot mounted so?"
-        + put
-    )
+    notes.check.append(sentence("gravity", said=said, put=put))
     return devices.with_gravity(folder, chosen, said) if chosen.text else chosen
 
 
@@ -218,24 +210,13 @@ def _check_robot(
         notes.check.append(f"{chosen.name}: the robot ends at {robot.tip}; is that its last link?")
     if not columns.drives:
         joints = ", ".join(j.name for j in robot.joints)
-        notes.check.append(
-            f"positions and torques are those of the joints, {joints}: if they are of motors, give"
-            " [robot.motors] and the reductions"
-        )
-    notes.check += [
-        f"no body has this, and the nearest that one can have is taken: {line}"
-        for line in robot.impossible
-    ]
+        notes.check.append(sentence("at_joints", joints=joints))
+    notes.check += [sentence("no_body", line=line) for line in robot.impossible]
     if robot.undrawn:
-        notes.check.append(
-            f"no mass is drawn on {join_names(robot.undrawn)}: put it in where there is a body"
-        )
+        notes.check.append(sentence("no_mass", links=join_names(robot.undrawn)))
     if UNKNOWN_CONSTANT not in chosen.text:
         return chosen
-    note = notes.ask(
-        f"torque_constant of each motor in {chosen.name}, N.m/A at the joint",
-        "the drive's data sheet, times the reduction",
-    )
+    note = notes.ask("torque_constants", device=chosen.name)
     return replace(chosen, text=chosen.text.replace(UNKNOWN_CONSTANT, f'= "{UNKNOWN}"{note}'))
 
 
@@ -261,6 +242,9 @@ def _trials_tables(
             stretch = {"recording": trial.recording, "start_s": start_s, "end_s": end_s}
             yield from (f"{key} = {value}" for key, value in stretch.items() if value is not None)
             yield from [f"part = {quoted(trial.part)}"] if trial.part else []
+            pairs = {c: own for c, own in trial.columns.items() if c in match.used and c != own}
+            called = ", ".join(f"{quoted(c)} = {quoted(own)}" for c, own in pairs.items())
+            yield from [f"columns = {{ {called} }}"] if called else []
             for part in trial.parts:
                 if not any(name.startswith(f"{part.name}:") for name in match.used):
                     continue
@@ -296,8 +280,7 @@ def _trial_kind(file: str, device: Device, notes: Notes) -> list[str]:
     if "viscous" in said:
         return [
             'kind = "viscous"' + notes.guess(f"{file} is a viscous trial, by its name"),
-            "viscous_n_s_per_m = 0.0"
-            + notes.ask("viscous_n_s_per_m, the damping", "the commands of the brakes' controller"),
+            "viscous_n_s_per_m = 0.0" + notes.ask("viscous"),
         ]
     return ['kind = "free"']
 

@@ -10,8 +10,9 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.chain import Branches
 from bampipe.data.device_file import complete_device, read_device_file
+from bampipe.data.names import REFERENCE_WORDS, words
 from bampipe.data.readers import is_text
-from bampipe.data.survey import REFERENCE_WORDS, Survey, SurveyedColumn, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit
 from bampipe.data.urdf import unexpanded
 from bampipe.errors import InputError
@@ -24,6 +25,7 @@ from bampipe.setup.hypotheses import MOST_TRAVEL
 from bampipe.setup.proposal import positions
 from bampipe.setup.proposal.joints import chain_logged
 from bampipe.setup.proposal.matching import Matcher
+from bampipe.setup.proposal.notes import sentence
 from bampipe.setup.proposal.positions import SLIDING, in_counts, is_velocity, needs_gain
 from bampipe.setup.proposal.starter import Drive, starter_device, weight_of
 
@@ -214,10 +216,7 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
         match.reacting = driver.name
         turned = replace(driver, values=-driver.values)
         fit = _rough_fit(position, turned, role, linear, match.t)
-        notes.check.append(
-            f"{driver.name} falls where the motion asks for more: it is taken for the reaction, its"
-            " sign turned"
-        )
+        notes.check.append(sentence("reaction", column=driver.name))
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
     if driver is not None:
         levered = (
@@ -265,17 +264,11 @@ def _has_coil(driver: SurveyedColumn | None, match: Matcher) -> bool:
     alike = [c for c, same in zip(currents, together, strict=True) if same]
     for current in alike:
         match.used.add(current.name)
-        match.notes.check.append(
-            f"{current.name} goes with {driver.name}: both are of the drive, and {driver.name} is"
-            " taken; either would do"
-        )
+        said = sentence("both_of_drive", current=current.name, driver=driver.name)
+        match.notes.check.append(said)
     coils = [c.name for c in currents if c.name not in match.used]
-    match.notes.check += [
-        f"{name} is taken for the current in the coil of a brake or damper; it is a commanded"
-        " value, since no measured current was found"
-        for name in coils
-        if REFERENCE_WORDS & set(words(name))
-    ]
+    commanded = [name for name in coils if REFERENCE_WORDS & set(words(name))]
+    match.notes.check += [sentence("coil", column=name) for name in commanded]
     return bool(coils)
 
 

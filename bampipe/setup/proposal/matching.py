@@ -7,15 +7,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.names import DRIVERS, REFERENCE_WORDS, words
 from bampipe.data.session import Register
-from bampipe.data.survey import DRIVERS, REFERENCE_WORDS, Survey, SurveyedColumn, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import is_of_motor, travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
 _NO_LESS = 0.03
-_SUPPLIED = frozenset(["in", "input", "supply", "bus", "battery"])
-"""Words in the name of what a converter takes up rather than what its motor gets."""
+_SUPPLIED = frozenset(["in", "input", "supply", "bus", "battery", "d", "id"])
+"""Words in the name of what a converter takes up, or of flux, rather than what turns a motor."""
 _NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
 Match = tuple[SurveyedColumn | None, str]
@@ -100,21 +101,30 @@ class Matcher:
     def of_another(self, position: SurveyedColumn) -> dict[str, str]:
         """Columns of another joint or trial, alike but for a number, by those of ``position``.
 
-        None unless what drives that position has such a number, too.
+        None unless what drives that position has such a number, too, or as many columns drive.
         """
         bare = ((c.name, re.sub(r"[\[(]\D*[\])]", "", c.name)) for c in self.found.columns)
         split = {name: re.split(r"(\d+|\b[A-Z]\b)", said) for name, said in bare}
         own = split[position.name]
         alike = (split[name] for name in self.rivals if split[name][::2] == own[::2])
         other = next((parts for parts in alike if parts != own), own)
+        known = [*self.used, *(c.name for c in self.given.values())]
         pairs = {
             name: called
-            for name in (*self.used, *(c.name for c in self.given.values()))
+            for name in known
             for called, parts in split.items()
             if split[name][1::2] == own[1::2] != parts[1::2] == other[1::2]
             and split[name][::2] == parts[::2]
         }
-        return pairs if any(c.name in pairs for c in self.found.of(*DRIVERS)) else {}
+        drives = [c for c in self.found.of(*DRIVERS) if not c.is_constant]
+        if any(c.name in pairs for c in drives):
+            return pairs
+        own_drive = next((c for c in drives if c.name in known), None)
+        likes = [c.name for c in drives if own_drive is not None and c.si == own_drive.si]
+        if own_drive is None or len(likes) != len(self.rivals):
+            return {}
+        place = 1 if position.name == self.rivals[0] else 0
+        return {position.name: self.rivals[place], own_drive.name: likes[place]}
 
     def _share(self, position: SurveyedColumn, column: SurveyedColumn) -> float:
         """The share of a column that the motion of a position explains, 0 if it is the position."""

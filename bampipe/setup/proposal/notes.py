@@ -1,17 +1,21 @@
 """The comments of a proposal, which are printed once more for its reader, and TOML values."""
 
 import json
+import tomllib
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from bampipe.lists import join_names
 
 UNKNOWN = "?"
 """Stands for a column that could not be found."""
-COLUMNS = "see the headers of the logs, or ask who wrote the logger"
-"""Where the name of a column is looked up."""
-UNDRIVEN = f"{COLUMNS}; what nothing drives shows ratios of inertia, weight and friction, no sizes"
-UNITS = "ask who wrote the logger, or see how far it moves; rad, deg, m and mm are usual"
-"""Where the unit of a position is."""
+_FILE = Path(__file__).with_name("sentences.toml")
+_SENTENCES = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+
+
+def sentence(name: str, **known: object) -> str:
+    """A sentence of ``sentences.toml`` on what was guessed, with the fields in it."""
+    return str(_SENTENCES["said"][name].format(**known))
 
 
 @dataclass
@@ -40,15 +44,20 @@ class Notes:
             self.check.append(text)
         return f"  # guess: {text}"
 
-    def ask_column(self, name: str, unit: str, where: str = COLUMNS) -> str:
+    def ask_column(self, name: str, unit: str, question: str = "column") -> str:
         """The comment on a column that could not be found, of what has that ``name``."""
-        return self.ask("the column of {}" + (unit and f" in {unit}"), where, name)
+        return self.ask(question, name, unit=unit and f" in {unit}")
 
-    def ask(self, text: str, where: str, of: str = "") -> str:
-        """The comment that marks what a person must fill in, and where to look it up.
+    def ask(self, question: str, of: str = "", **known: object) -> str:
+        """The comment that marks what a person must fill in.
 
-        What is asked ``of`` several, which {} stands for in the text, becomes one question.
+        Args:
+            question: its name in ``sentences.toml``, which says where to look it up, too.
+            of: what it is asked of; what is asked of several becomes one question.
+            known: the other fields of its text.
         """
+        own = _SENTENCES[question]
+        text, where = (own[part].format(of="{}", **known) for part in ("ask", "where"))
         self.fill_in.setdefault((text, where), []).append(of)
         return f"  # fill in: {text.replace('{}', of)}"
 

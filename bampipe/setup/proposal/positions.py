@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.names import DRIVERS, words
 from bampipe.data.quality.clock import find_fresh_rows
 from bampipe.data.quality.encoders import integral, unwrapped
 from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_spikes
 from bampipe.data.session import Register
-from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit
+from bampipe.data.vocabulary import word_set
 from bampipe.setup.proposal.notes import Notes
 
-SLIDING = frozenset(["stroke", "displacement", "disp", "dist", "weg", "hub", "carriage", "piston"])
+SLIDING, _SHARES = map(word_set, ("sliding", "shares"))
+_FORCES, _TORQUES = map(word_set, ("forces", "torques"))
 _FEWEST_COUNTS = 100
-_SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
-_FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
-_TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
 _MOST_WILD = 0.01
 """Share of the readings that are wild or missing, the most."""
 
@@ -58,7 +58,9 @@ def slides(column: SurveyedColumn, found: Survey) -> bool:
     """Whether an axis slides rather than turns: by its unit, its name, or a force in newtons."""
     if column.si:
         return column.si in ("m", "m/s")
-    return bool(set(words(column.name)) & SLIDING) or any(f.si == "N" for f in found.of("force"))
+    said, forces = set(words(column.name)), found.of("force")
+    along = bool(said & {"x", "y", "z"}) and any(is_force(f) for f in forces)
+    return along or bool(said & SLIDING) or any(f.si == "N" for f in forces)
 
 
 def travelled(column: SurveyedColumn, t: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from bampipe.setup import drawn_bodies
 from bampipe.setup.drawn_bodies import Comparison, Drive, find_heavy, mean_left
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.proposal.joints import Group, pair_joints
-from bampipe.setup.proposal.notes import Notes
+from bampipe.setup.proposal.notes import Notes, sentence
 from bampipe.setup.proposal.positions import in_counts, position_in_si, scale_to
 
 BEYOND = 1.5
@@ -38,10 +38,6 @@ _ALTERNATIONS = 2
 """How often zeros are sought with the reductions found so far, and reductions with these zeros."""
 _BETTER = 0.5
 """Of what one order of the joints leaves unexplained: another one must leave less."""
-PUT_IN = (
-    "put those of the gears into [robot.motors] of the device file, take session.toml away, and run"
-    " `bampipe init` again, which takes them from there"
-)
 _OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}
 
 
@@ -241,10 +237,7 @@ def find_robot_columns(
     other = logged.explain(other_unit, drives, turns) if other_unit else None
     if other_unit and other and mean_left(other.drives) < _BETTER:
         positions, best = other_unit, other
-        notes.check.append(
-            "positions state no unit and go beyond the joints' ranges: degrees are taken; if they"
-            f" are radians of motors, {PUT_IN}"
-        )
+        notes.check.append(sentence("degrees", put_in=sentence("put_in")))
     left, sound = mean_left(best.drives), drawn_bodies.fits(best.drives)
     beyond = _beyond_range(logged, positions, of_joint=sound)
     guessed = positions is not stated and left > _DOUBTED
@@ -272,11 +265,8 @@ def find_robot_columns(
         ordered = positions.reordered(order), drives.reordered(order)
         other = logged.explain(*ordered, turns)
         if other is not None and mean_left(other.drives) < _BETTER * left:
-            notes.check.append(
-                "columns stand in the alphabetical order of the joints' names, since weight and"
-                f" inertia as drawn explain {1.0 - mean_left(other.drives):.1%} of the drives that"
-                f" way, {max(1.0 - left, 0.0):.1%} in the order of the chain"
-            )
+            so, otherwise = 1.0 - mean_left(other.drives), max(1.0 - left, 0.0)
+            notes.check.append(sentence("alphabetical", so=so, otherwise=otherwise))
             best, (positions, drives) = other, ordered
     if device.force_unit != "A" and (heavy := find_heavy(best.compared, best.mounting)):
         in_tip = _placed_in_tip(folder, robot)
@@ -303,13 +293,8 @@ def _geared(
     ratio = [float(r) if given else float(f"{r:.4g}") for r in found.ratio]
     gears = {joint: r for joint, r in zip(joints, ratio, strict=True) if r != 1.0}
     listed = ", ".join(f"{joint} {turns:g}" for joint, turns in gears.items())
-    notes.check.append(
-        "positions are those of motors, which turn for one of the joint as the device file says:"
-        f" {listed}"
-        if given
-        else "positions are those of motors, by weight and inertia as drawn with these turns for"
-        f" one of the joint: {listed}; {PUT_IN}"
-    )
+    name = "motors_given" if given else "motors_found"
+    notes.check.append(sentence(name, turns=listed, put_in=sentence("put_in")))
     notes.check.append(_explained(found.drives))
     drives = dict(zip(device.forces, found.drives, strict=True))
     return RobotColumns(joints, columns, drives, gears, found.mounting)
@@ -342,16 +327,10 @@ def _beyond_range(logged: Logged, positions: Group, of_joint: bool) -> list[str]
     for c, column, width in joints:
         span = float(np.ptp(np.nan_to_num(column.values))) * scale_to(c.unit, column)
         if span > BEYOND * width:
-            why = "weight and inertia as drawn agree with that: is the range of the drawing right?"
-            if not of_joint:
-                why = (
-                    f"a position of the motor, which turns {span / width:.3g} times for one of the"
-                    f" joint or more? {PUT_IN}"
-                )
-            found.append(
-                f"{column.name} travels {span:.3g} {c.unit}, and the range of {c.name} is"
-                f" {width:.3g}: {why}"
-            )
+            why = "range_wrong" if of_joint else "motor_beyond"
+            why = sentence(why, turns=span / width, put_in=sentence("put_in"))
+            of = {"column": column.name, "unit": c.unit, "joint": c.name}
+            found.append(sentence("beyond_range", **of, span=span, width=width, why=why))
     return found
 
 
@@ -373,11 +352,7 @@ def _sentences(
     lines, agreed = [], []
     together = len(drives) > 1 and all(drive.is_turned for drive in drives.values())
     if together:
-        lines.append(
-            "all drives have the other sign, as torques on a drive rather than by it have: weight"
-            " and inertia as drawn, and friction, say so of each; `scale = -1.0` of each"
-            " channel sets that right"
-        )
+        lines.append(sentence("all_turned"))
     for c, (name, drive) in zip(device.coordinates, drives.items(), strict=True):
         column = columns[name].name
         if not drive.is_sure:
@@ -401,21 +376,11 @@ def _sentences(
         elif not said:
             agreed.append(f"{c.name} {size:.2f}")
         if said:
-            lines.append(
-                f"{column} is {share:.2g} ± {drive.error:.1g} times what the drawing"
-                f" requires: {'; and '.join(said)}"
-            )
-    if agreed and device.force_unit == "A":
-        lines.append(
-            f"torque constants by weight and inertia as drawn, and no better than these:"
-            f" {', '.join(agreed)}; put in those of the data sheet, gears included, or have them"
-            " estimated by that of one"
-        )
-    elif agreed:
-        lines.append(
-            f"signs and sizes of the drives agree with weight and inertia as drawn (1 is perfect):"
-            f" {', '.join(agreed)}"
-        )
+            of = {"column": column, "share": share, "error": drive.error}
+            lines.append(sentence("drive_size", **of, why="; and ".join(said)))
+    if agreed:
+        name = "constants" if device.force_unit == "A" else "agreed"
+        lines.append(sentence(name, agreed=", ".join(agreed)))
     return [*lines, _explained(list(drives.values()))]
 
 

@@ -5,23 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bampipe.data.angle_torque import Reading
 from bampipe.data.guesses import Driven
-from bampipe.data.survey import REFERENCE_WORDS, Survey, SurveyedColumn, words
+from bampipe.data.names import REFERENCE_WORDS, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit as unit_named
+from bampipe.data.vocabulary import word_set
 from bampipe.physics.device import KINDS
 from bampipe.physics.expression import FUNCTIONS
 from bampipe.setup.hypotheses import MOST_TRAVEL
+from bampipe.setup.proposal.notes import sentence
 from bampipe.setup.proposal.positions import in_counts
 
-_NAMELESS = (
-    "enc encoder pos position angle counts ticks displacement disp stroke present actual act"
-    " measured meas current state value deg degree degrees rad radian radians vel velocity speed"
-    " header feedback column ang motion dist percent rec log data mot motor field run runs"
-    " observation ist akt grad rev mesure mesuree medido misurato gemessen trial experiment"
-    " inertia offset moment inkremente increments samples channels signals"
-)
-"""Words in the name of a position that name no axis."""
+_NAMELESS = word_set("nameless")
 _FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "eff", "torque", "tau"}
 _DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
 _PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
@@ -36,16 +31,7 @@ _SOURCES = {
 }
 """Constants that only their user knows: value to start from, unit, and where to look them up."""
 
-_ANGLES = frozenset(
-    ["angle", "theta", "phi", "psi", "winkel", "joint", "rotation", "deg", "rad", "degrees"]
-)
-_UPRIGHT = frozenset(["yaw", "pan", "azimuth", "heading"])
-"""What an axis that stands upright, and carries no weight, is called."""
-_DOUBTS: dict[Reading, str] = {
-    "either": "a torque follows the angle, and over so short a travel a spring's looks alike",
-    "both": "a torque follows the angle, and neither weight nor a spring alone explains it; what is"
-    " beside it, a cable, a spring, a ripple, is for diagnose to name",
-}
+_ANGLES, _UPRIGHT = map(word_set, ("turning", "upright"))
 _LEAST_WEIGHT, _USUAL_GEAR = 1e-3, 10.0
 """Spread of a weight of which nothing shows, N.m; turns of a motor whose gear is not known."""
 
@@ -97,12 +83,9 @@ def weight_of(
         return None, ""
     reading = fit.pose.reading if fit.pose is not None else "nothing"
     if fit.pose is not None and reading == "spring" and not geared:
-        return None, (
-            "no gravity: a torque follows the position as that of a spring does, not as weight"
-            " does; diagnose has a name for it"
-        )
+        return None, sentence("spring")
     if fit.pose is not None and fit.pose.is_gravity:
-        doubt = _DOUBTS.get(reading, "")
+        doubt = sentence(reading) if reading in ("either", "both") else ""
         said = f"gravity: {doubt}" if doubt else "gravity, since the motion shows it"
         return Weight(fit.pose.moments, max(map(abs, fit.pose.moments)), doubt), said
     if not _may_carry(position, found, geared):
@@ -140,7 +123,7 @@ def starter_device(
         weight: gravity on the axis, None where it carries none.
         sign_width: of the sign of the velocity, rad/s or m/s; 0 for the usual one.
     """
-    taken = {*_NAMELESS.split(), *FUNCTIONS}
+    taken = {*_NAMELESS, *FUNCTIONS}
     item = re.search(r"\[([A-Za-z]\w*)\]", position)  # of a list, such as position[elbow]
     parts = [item[1]] if item and unit_named(item[1]) is None else []
     names = [w for p in (*parts, position) for w in words(p) if w not in taken and len(w) > 2]

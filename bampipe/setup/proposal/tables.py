@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.names import words
 from bampipe.data.quality.clock import spread_stamps, unroll
 from bampipe.data.session import SECONDS, Register
 from bampipe.data.stated_rate import interval_of
-from bampipe.data.survey import Survey, SurveyedColumn, words
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import bare, spelled, unit
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.matching import Match, Matcher
-from bampipe.setup.proposal.notes import UNDRIVEN, UNITS, UNKNOWN, Notes, entry, quoted
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted, sentence
 from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
 
 UNKNOWN_RATE = f'sample_rate_hz = "{UNKNOWN}"'
@@ -32,14 +33,13 @@ _MIXED = 0.1
 """Share of steps at which times fall that are all different, of rows that stand out of order."""
 _SLOW_HZ = 40.0
 """Below, accelerations of a joint that stops within a tenth of a second are not seen."""
-_OF_ROWS = "the logger's set-up has it; else the number of rows over the seconds that they took"
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
 _SURE, _NEAR = 2.0, 0.025
-"""Standard errors, and share, within which a power of two, as most encoders count, is what a turn
-counts."""
+"""Standard errors, and share, within which a number that encoders have is what a turn counts."""
+_ROUND = [digits * 10.0**n for digits in (1, 2, 3.6, 4, 5, 8) for n in (3, 4)]
+_COUNTS = [*(2.0**n for n in range(8, 25)), *_ROUND]
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "kip", "V")
-_LOGGER = "its manual, or ask who wrote the logger"
 _QUANTITY = {"N": "force", "N.m": "torque", "A": "current", "V": "voltage"}
 _MOST_VOLTS = 60.0
 """Of a supply: servos count theirs in tenths."""
@@ -64,8 +64,11 @@ class ProposedClock:
 
 def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     """Propose a clock: by stamps in one column or two, else by counting samples."""
-    counters = [c for c in found.columns if not c.role and not _COUNTERS.isdisjoint(words(c.name))]
-    unnamed = [c for c in found.columns if not c.role and c not in counters and _counts_on(c)]
+    nameless = [c for c in found.columns if c.by_looks or not c.role]
+    numbers = {c.name for c in nameless if np.all(np.diff(c.values) == 1.0)}
+    unsaid = [c for c in found.columns if not c.role]
+    counters = [c for c in unsaid if not _COUNTERS.isdisjoint(words(c.name))]
+    unnamed = [c for c in unsaid if c not in counters and _counts_on(c)]
     whole = [c for c in found.of("time") if c.is_integer]
     for rest in reversed(whole):
         for seconds in reversed(whole):
@@ -80,8 +83,8 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
         return c.name.endswith(_RECORDED), "stamp" not in words(c.name), not beside
 
     stamped = [*sorted(found.of("time"), key=rank), *counters, *unnamed]
-    column = next((c for c in stamped if _increases(c.values)), None)
-    return _count_samples(found, notes) if column is None else _in_one_column(column, notes)
+    rising = [c for c in stamped if c.name not in numbers and _increases(c.values)]
+    return _in_one_column(rising[0], notes) if rising else _count_samples(found, notes)
 
 
 def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
@@ -93,7 +96,7 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     named_unit = next((u for u in ("us", "ms", "ns", "min") if u in words(column.name)), "")
     counter = not _COUNTERS.isdisjoint(words(column.name)) or column.role != "time"
     plain = spelled(column.unit, tuple(SECONDS)) in SECONDS
-    counter &= not named_unit and not plain
+    counter &= column.is_integer and not named_unit and not plain
     kind = "" if counter else guesses.time_unit(stamps + start, column.unit or named_unit)
     written = f"{column.name} {column.unit}"
     tick = re.search(r"(?<![\d.])(\d*\.?\d+) ?_?(ns|us|ms)(?![A-Za-z])", written)
@@ -105,16 +108,10 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
         return ProposedClock(t, (column.name,), lines, _stamped_rate(t, notes))
     if not kind:
         if counter:
-            step = float(np.median(np.diff(stamps)))
-            note = notes.ask(
-                f"ticks_per_s, what {column.name} counts in a second, and sample_rate_hz, 1/"
-                f"{step:.6g} of it",
-                "the clock of the timer or processor, in its data sheet or firmware; else what it"
-                " counted over the seconds that the recording took",
-            )
+            note = notes.ask("ticks", clock=column.name, step=np.median(np.diff(stamps)))
             lines = [named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}"]
         else:
-            note = notes.ask("the unit of time: no unit gives a likely rate", _OF_ROWS)
+            note = notes.ask("time_unit")
             lines = [named, f'unit = "{UNKNOWN}"{note}']
         return ProposedClock(np.arange(len(stamps)) / _LIKELY_RATE_HZ, (column.name,), lines)
     t = stamps * SECONDS.get(kind, 1.0)
@@ -163,11 +160,7 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
         return ProposedClock(samples / rate_hz, taken, counted, f"sample_rate_hz = {rate_hz:g}")
     numbers = next((c for c in found.columns if not c.role and _numbers_rows(c)), None)
     if numbers is not None:
-        note = notes.ask(
-            f"ticks_per_s and sample_rate_hz, both the rows a second: {numbers.name} numbers the"
-            " rows, and some are lost",
-            _OF_ROWS,
-        )
+        note = notes.ask("row_numbers", clock=numbers.name)
         lines = f"column = {quoted(numbers.name)}", 'unit = "ticks"', f"ticks_per_s = 0.0{note}"
         t = (numbers.values - numbers.values[0]) / _LIKELY_RATE_HZ
         return ProposedClock(t, (numbers.name,), lines)
@@ -182,17 +175,18 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
                 remedy="sort its rows by their time",
             )
         why = f"{stamps.name} falls at {np.sum(steps < 0)} and stands at {np.sum(steps == 0)} steps"
+        why = why if steps.min() <= 0 else f"{stamps.name} numbers the rows"
     if rates:
         why += f", and the rates are {join_names(f'{rates[n]:g} Hz by {n}' for n in rates)}"
     note = notes.guess(f"samples are counted: {why}")
-    rate = UNKNOWN_RATE + notes.ask("sample_rate_hz, rows a second", _OF_ROWS)
+    rate = UNKNOWN_RATE + notes.ask("rate")
     return ProposedClock(samples / _LIKELY_RATE_HZ, (), (f'unit = "samples"{note}',), rate)
 
 
 def _counts_on(column: SurveyedColumn) -> bool:
-    """Whether a column whose name says nothing rises evenly, otherwise than as a number of rows."""
+    """Whether a column whose name says nothing rises evenly."""
     steps = np.diff(column.values)
-    return guesses.is_time(column.values) and bool(np.ptp(steps) < np.median(steps) != 1.0)
+    return guesses.is_time(column.values) and bool(np.ptp(steps) < np.median(steps))
 
 
 def _numbers_rows(column: SurveyedColumn) -> bool:
@@ -235,11 +229,7 @@ def encoders_table(device: Device, match: Matcher) -> tuple[list[str], dict[str,
         if pairs := match.of_another(column):
             named = ", ".join(f"{quoted(one)} = {quoted(other)}" for one, other in pairs.items())
             table = table.replace(quoted(column.name), quoted(UNKNOWN), 1) + match.notes.ask(
-                f"which is meant, {column.name} or {pairs[column.name]}: are they of two joints, or"
-                " trials of one?",
-                "of a robot's joints, name one, or put its URDF beside the logs; of trials, name"
-                f" {column.name}, and list the file again for each other, with columns ="
-                f" {{ {named} }} in its [[trials]]",
+                "which", column=column.name, other=pairs[column.name], pairs=named
             )
         lines.append(f"{axis.name} = {table}")
     return [*lines, ""], axes
@@ -256,36 +246,26 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
         said = spelled(column.unit, _POSITION_UNITS)
         fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
         fields += f", scale_sd = {_rounded(sd / turns)}"
-        return entry(column.name, said, fields) + match.notes.guess(
-            f"{column.name} is the position of the motor of {axis.name}, which turns {turns:.4g} ±"
-            f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
-            " the angle; put in the ratio of the gear"
-        )
+        of = {"column": column.name, "axis": axis.name, "turns": turns, "sd": _rounded(sd)}
+        return entry(column.name, said, fields) + match.notes.guess(sentence("geared", **of))
     if column.name == match.geared:
         said = spelled(column.unit, _POSITION_UNITS)
         return entry(column.name, said, ", gear_ratio = 0.0") + match.notes.ask(
-            f"gear_ratio of {axis.name}, turns of {column.name} for one of it, 1 without a gear",
-            "the gear's data sheet; the torque goes with the angle as weight behind a gear does",
+            "gear", axis=axis.name, column=column.name
         )
     right, geared = column.si == axis.unit, axis.name in match.robot.gears
+    if column.si == "V":
+        return entry(column.name, UNKNOWN) + match.notes.ask("volts_of_position", column.name)
     if (column.by_looks or column.is_foreign) and not right:
         looks = f"which looks like the position of {axis.name}"
         said = f"stated as '{column.stated}'" if column.is_foreign else looks
-        note = match.notes.ask("the unit of {}", UNITS, f"{column.name}, {said}")
+        note = match.notes.ask("position_unit", f"{column.name}, {said}")
         return entry(column.name, UNKNOWN, _velocity_beside(axis, match)) + note
-    if column.si == "V":
-        return entry(column.name, UNKNOWN) + match.notes.ask(
-            "the unit of {}, what one volt of it is, such as 47.7deg",
-            "the sensor's certificate, or what it reads in two places that are known",
-            column.name,
-        )
     if not right and worth is not None:
         return entry(column.name, UNKNOWN) + match.notes.ask(
-            f"the unit of {column.name}, which nothing states: by the weight on {axis.name},"
-            f" 1 rad reads {worth.size:.4g} ± {_rounded(worth.sd)}; for a sensor on the motor side"
-            f" of a gear ({2.0 * np.pi * worth.size:.3g} to a turn), give unit and gear_ratio",
-            f"{UNITS}; rev is too",
-        )
+            "position_unit_by_weight", column=column.name, axis=axis.name, size=worth.size,
+            sd=_rounded(worth.sd), turn=2.0 * np.pi * worth.size,
+        )  # fmt: skip
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
     said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
     fields, how = _counting(axis, said, match, match.robot.gears.get(axis.name, 1.0))
@@ -325,8 +305,7 @@ def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
     si = f"{axis.unit}/s"
     if column.is_foreign:
         return entry(column.name, UNKNOWN) + notes.ask(
-            f"the unit of {column.name}, stated as '{column.stated}', which is integrated",
-            "ask who wrote the logger; rad/s, rev/min and mm/s are usual",
+            "velocity_unit", column=column.name, stated=column.stated
         )
     said = (spelled(column.unit, _SPEED_UNITS) if column.si == si else "") or si
     integral = f"that of {axis.name} is the integral of {column.name}, in {said}"
@@ -343,24 +322,17 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
     worth = match.turning.get(column.name)
     if worth is not None:
         turn, sd = 2.0 * np.pi * worth.size, 2.0 * np.pi * worth.sd
-        power = 2.0 ** round(np.log2(turn))
-        is_power = abs(turn - power) < max(_SURE * sd, _NEAR * power)
-        size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}"
-        scale_sd = "" if is_power else f", scale_sd = {_rounded(sd / turn)}"
-        taken = f" ({power:.0f}, a power of two, is taken)" if is_power else ""
-        return count(size, worth.zero, scale_sd) + match.notes.guess(
-            f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}{taken}, and"
-            f" {worth.zero:.0f} where it hangs, by its weight, which goes with the sine of the"
-            " angle; put in the encoder's counts a turn, times the gear, by 2 pi"
-        )
-    return count("0.0", float(np.median(column.values))) + match.notes.ask(
-        f"counts_per_unit of {{}}, the counts in one {axis.unit}; zero_counts is a guess"
-        + (" of what is read where the drawing has 0" if match.robot.joints else ""),
-        "counts a turn in the encoder's data sheet, times the gear, by 2 pi"
-        if axis.unit == "rad"
-        else "the scale's data sheet",
-        axis.name,
-    )
+        usual = min(_COUNTS, key=lambda counts: abs(turn - counts))
+        is_usual = abs(turn - usual) < max(_SURE * sd, _NEAR * usual)
+        size = f"{(usual if is_usual else turn) / (2.0 * np.pi):.6g}"
+        scale_sd = "" if is_usual else f", scale_sd = {_rounded(sd / turn)}"
+        taken = f" ({usual:.0f}, as encoders have, is taken)" if is_usual else ""
+        of = {"column": column.name, "axis": axis.name, "turn": turn, "sd": _rounded(sd)}
+        said = sentence("counts", **of, taken=taken, zero=worth.zero)
+        return count(size, worth.zero, scale_sd) + match.notes.guess(said)
+    drawn = " of what is read where the drawing has 0" if match.robot.joints else ""
+    ask = match.notes.ask(f"counts_{axis.unit}", axis.name, zero=drawn)
+    return count("0.0", float(np.median(column.values))) + ask
 
 
 def _rounded(sd: float) -> str:
@@ -389,7 +361,7 @@ def input_tables(device: Device, axes: Mapping[str, SurveyedColumn], match: Matc
         match.used |= {column.name for column in forces}
         names = [column.name for column in forces] or [UNKNOWN] * len(device.forces)
         missing = " and ".join(device.forces)
-        ask = "" if forces else notes.ask_column(missing, device.force_unit, UNDRIVEN)
+        ask = "" if forces else notes.ask_column(missing, device.force_unit, "driving_column")
         unit_of = [f'unit = "{device.force_unit}"']
         if forces:
             why = given[device.forces[0]][1]
@@ -420,68 +392,46 @@ def _force_unit(
     known = unit(common)
     names = ", ".join(quoted(column.name) for column in columns)
 
-    def ask_unit(question: str, where: str) -> list[str]:
-        return [f'unit = "{UNKNOWN}"{notes.ask(question, where)}']
+    def ask_unit(question: str, **known: str) -> list[str]:
+        return [f'unit = "{UNKNOWN}"{notes.ask(question, columns=names, **known)}']
 
     if columns[0].name == of_motor:
-        return ask_unit(
-            f"the unit of {names}, the torque of a motor by its name, at the joint: with the gear"
-            " before it, as 70N.m for 70 turns, or N.m without a gear",
-            "the gear's data sheet",
-        )
+        return ask_unit("motor_torque_unit")
     if known is not None and known.si == device.force_unit and common:
         stated = all(column.stated for column in columns)
         guess = f"{names} is a {_QUANTITY[known.si]} in {common}"
         return [f'unit = "{common}"' + ("" if stated else notes.guess(guess))]
     if len({unit(column.unit) for column in columns if column.unit}) > 1:
-        listed = join_names([column.unit for column in columns])
-        return ask_unit(
-            f"one unit of {names}, which are logged in {listed}",
-            "export them in one, as a force has one unit; it goes here",
-        )
+        return ask_unit("one_force_unit", units=join_names([column.unit for column in columns]))
     counted = any(map(needs_gain, columns))
     if common == "V" or counted:
         row = f"[{', '.join(['0.0'] * len(columns))}]"
         rows = f"[{', '.join([row] * len(columns))}]"
-        ask = notes.ask(
-            f"calibration_n_per_v, {device.force_unit} for one "
-            + (f"of {names}" if counted else "volt"),
-            "the sensor's certificate or the driver's manual, or hang a known weight on it",
-        )
+        of_what = f"of {names}" if counted else "volt"
+        ask = notes.ask("calibration", si=device.force_unit, of_what=of_what)
         if counted:
             volts = notes.guess(f"{names} counts or is a share: like volts it gets a calibration")
             zero = notes.guess(f"{names} is 0 without force")
         else:
             volts = notes.guess("the force channels are volts, by their names")
-            zero = notes.ask("zero_v, the volts without force", "a log of the unloaded sensor")
+            zero = notes.ask("zero_volts")
         return [f'unit = "V"{volts}', f"calibration_n_per_v = {rows}{ask}", f"zero_v = {row}{zero}"]
     odd = next((column for column in columns if column.is_foreign), None)
     if odd is not None or any(c.by_looks or not (c.role or c.unit or why) for c in columns):
         looks = "which looks like what drives the motion"
-        return ask_unit(
-            f"the unit of {names}, " + (f"stated as '{odd.stated}'" if odd is not None else looks),
-            'ask who wrote the logger; "N.m" and "N" are usual, and volts or counts are "V" with'
-            " a calibration_n_per_v",
-        )
+        return ask_unit("force_unit", why=f"stated as '{odd.stated}'" if odd is not None else looks)
     other = next(
         (c for c in columns if c.si not in (None, "", "V", "kg", "N", device.force_unit)), None
     )
     if other is not None:
-        return ask_unit(
-            f"the force: {other.name} is in {bare(other.unit)} and follows the motion, but is none",
-            "a channel of a force sensor; of a cylinder, log pressure times area in its place",
-        )
+        return ask_unit("no_force", column=other.name, unit=bare(other.unit))
     note = ""
     if any(column.si == "kg" for column in columns):
         common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
         note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
     if device.force_unit == "N.m" and any(map(is_force, columns)):
         note = note or ("" if common else notes.guess(f"{names} is a force in N"))
-        ask = notes.ask(
-            f"lever_m, how far from the axis {names} acts, m",
-            "measure it on the machine, or take it from the drawing; if the column is a torque"
-            ' already, put unit = "N.m" and take lever_m out',
-        )
+        ask = notes.ask("lever", columns=names)
         return [f'unit = "{common or "N"}"{note}', f"lever_m = 0.0{ask}"]
     if note:
         return [f'unit = "{common}"{note}']
@@ -533,24 +483,16 @@ def _channel(name: str, si: str, column: SurveyedColumn, why: str, match: Matche
             return table
         return table + notes.guess(f"{column.name} is {name}{why}{_unscaled(si, column, register)}")
     if column.is_foreign and si and not register:
-        question = f"the unit of {column.name}, stated as '{column.stated}'"
-        return entry(column.name, UNKNOWN, fields) + notes.ask(question, _LOGGER)
+        ask = notes.ask("channel_unit", column=column.name, stated=column.stated)
+        return entry(column.name, UNKNOWN, fields) + ask
     if register and si and not column.unit:
-        return entry(column.name, UNKNOWN, fields) + notes.ask(
-            f"the unit of {column.name}, what one count is, such as 2.69mA; {register.words}",
-            "the drive's table of registers",
-        )
+        ask = notes.ask("register_unit", column=column.name, register=register.words)
+        return entry(column.name, UNKNOWN, fields) + ask
     if si == "A" and column.is_integer and not column.unit:
-        return entry(column.name, UNKNOWN, fields) + notes.ask(
-            f"the unit of {column.name}, whose whole numbers are mA or counts, such as 2.69mA",
-            "the drive's table of registers",
-        )
+        return entry(column.name, UNKNOWN, fields) + notes.ask("current_unit", column=column.name)
     if column.conversion is not None and column.si != si:
-        return entry(column.name, si, f"{fields}, scale = 0.0") + notes.ask(
-            f"the scale of {{}}, {si} for one {bare(column.unit)}, in which its column is",
-            "of a share, what is rated, in the drive's data sheet",
-            name,
-        )
+        ask = notes.ask("rated", name, si=si, unit=bare(column.unit))
+        return entry(column.name, si, f"{fields}, scale = 0.0") + ask
     likely = si if register else guesses.likely_unit(si, column.values) or si
     if name == "supply" and column.is_integer and float(np.nanmedian(column.values)) > _MOST_VOLTS:
         likely = "0.1V"
@@ -558,10 +500,8 @@ def _channel(name: str, si: str, column: SurveyedColumn, why: str, match: Matche
         most = float(np.nanmax(np.abs(column.values)))
         if most > 100.0:
             said = f", {register.words}" if register else ""
-            return entry(column.name, "", f"{fields}, scale = 0.0") + notes.ask(
-                f"the scale of {name}, 1 over the reading of {column.name} at full duty{said}",
-                "the servo's table of registers: in steps of 0.1 % it is 0.001",
-            )
+            ask = notes.ask("duty", name=name, column=column.name, register=said)
+            return entry(column.name, "", f"{fields}, scale = 0.0") + ask
         if most > _FULL_DUTY:
             likely = "%"
     where = f" in {likely}" if si else ""
