@@ -25,7 +25,6 @@ from bampipe.progress import Progress, silent
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
 from bampipe.results.floor import AT_FLOOR, FLOOR_SDS
 from bampipe.results.identify import BaseEstimate, IdentifyResult, ParameterEstimate
-from bampipe.results.intervals import NORMAL_95
 from bampipe.results.pair import (
     FAMILY_ERROR,
     Journey,
@@ -36,6 +35,7 @@ from bampipe.results.pair import (
     StateChange,
     Travel,
 )
+from bampipe.results.rounding import NORMAL_95
 from bampipe.results.validate import ValidateResult
 from bampipe.run import models
 from bampipe.trials.linearisation import Linearisation, linearise_fit
