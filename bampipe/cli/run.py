@@ -184,13 +184,13 @@ def _write_summaries(
     outcomes: Sequence[Outcome], junit: Path | None, markdown: Path | None
 ) -> None:
     """Write the verdicts of the gates as JUnit XML, and add a summary in Markdown, where asked."""
-    from bampipe.run import junit as junit_xml
-    from bampipe.run.markdown import summary
+    from bampipe.run import summaries
 
     for path, mode in ((junit, "wb"), (markdown, "ab")):
         if path is None:
             continue
-        content = junit_xml.junit(outcomes) if path is junit else summary(outcomes).encode()
+        xml = path is junit
+        content = summaries.junit(outcomes) if xml else summaries.markdown(outcomes).encode()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open(mode) as stream:
