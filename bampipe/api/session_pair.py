@@ -1,11 +1,10 @@
 """Comparison of two sessions of one device, and prediction of each by the model of the other."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -62,7 +61,7 @@ class _Side:
     validated: ValidateResult
 
     @classmethod
-    def read(cls, root: Path, name: str, model: str) -> _Side:
+    def read(cls, root: Path, name: str, model: str) -> Self:
         run, model = RunFolder(root), models.choose_model(root, model)
         found, validated = run.read(IdentifyResult, model), run.read(ValidateResult, model)
         system = compile_model(load_model(run, model))
@@ -73,7 +72,7 @@ class _Side:
     def effects(self) -> tuple[str, ...]:
         return tuple(effect.name for effect in self.system.model.effects)
 
-    def predict(self, other: _Side) -> Linearisation:
+    def predict(self, other: Self) -> Linearisation:
         """Evaluate this model on the trials of ``other`` without a refit."""
         trials = read_measured_trials(other.run, self.system, timing=other.found.input_timing)
         return linearise_fit(

@@ -1,7 +1,5 @@
 """One stage of a run as a command: its settings, its result, the next command."""
 
-from __future__ import annotations
-
 import inspect
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -78,7 +76,7 @@ def run_stage(
     session: Path | None = None,
     model: str = "",
     more: Mapping[str, object] | None = None,
-) -> Outcome:
+) -> "Outcome":
     """Run one stage on the results of earlier ones, and print its findings.
 
     Args:
@@ -120,7 +118,7 @@ def run_stage(
     return outcome
 
 
-def _say_if_outdated(root: Path, pipeline: Pipeline, model: str) -> None:
+def _say_if_outdated(root: Path, pipeline: "Pipeline", model: str) -> None:
     """Print a note if a diagnosis that has just been used was made from other results."""
     from bampipe.run.status import status
 
