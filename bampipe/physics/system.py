@@ -1,5 +1,7 @@
 """The compiled model: generated functions, loaded from a cache on disk if they exist."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -127,7 +129,7 @@ class System:
         ]
 
     @cached_property
-    def _effects_on_force(self) -> "list[tuple[list[int], System]]":
+    def _effects_on_force(self) -> list[tuple[list[int], System]]:
         """Each effect that changes how a force acts: numbers of its parameters, and it alone."""
         names, found = [q.name for q in self.parameters], list[tuple[list[int], System]]()
         for item in self.model.effects if self.driven or self.force_fed else ():
