@@ -1,11 +1,10 @@
 """The one exception that a user's mistake may raise, and text that is safe to show."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from typing import Self
 
 
 def printable(text: str) -> str:
@@ -35,7 +34,7 @@ class InputError(Exception):
     """
 
     def __init__(
-        self, what: str, *, where: str = "", remedy: str = "", others: Sequence[InputError] = ()
+        self, what: str, *, where: str = "", remedy: str = "", others: Sequence[Self] = ()
     ) -> None:
         self.what = what
         self.where = where

@@ -1,14 +1,10 @@
 """Progress reports of long work."""
 
-from typing import Protocol
+from collections.abc import Callable
 
-
-class Progress(Protocol):
-    """A callback with which a stage reports its progress."""
-
-    def __call__(self, fraction: float, message: str) -> None:
-        """Report that ``fraction`` (0 to 1) is done; ``message`` names the work in progress."""
+Progress = Callable[[float, str], None]
+"""Called with the fraction that is done, 0 to 1, and a message that names the work in progress."""
 
 
 def silent(fraction: float, message: str) -> None:
-    """A :class:`Progress` that shows nothing."""
+    """A `Progress` that shows nothing."""

@@ -1,7 +1,5 @@
 """Worker processes, which end with their parent, however it ends."""
 
-from __future__ import annotations
-
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -58,7 +56,7 @@ def process_pool(
     *arguments: Any,
     nested: bool = False,
     hear: Callable[[Any], None] = lambda message: None,
-) -> Iterator[ProcessPool]:
+) -> "Iterator[ProcessPool]":
     """A pool of worker processes for the length of the block; unfinished tasks are then dropped.
 
     Args:
@@ -91,7 +89,7 @@ class ProcessPool:
     """
 
     def __init__(
-        self, workers: list[_Worker], start: Callable[[], None], hear: Callable[[Any], None]
+        self, workers: "list[_Worker]", start: Callable[[], None], hear: Callable[[Any], None]
     ) -> None:
         self._workers, self._start, self._hear = workers, start, hear
         self._waiting: deque[_Task] = deque()

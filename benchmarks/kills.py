@@ -32,7 +32,7 @@ from pathlib import Path
 import psutil
 
 from bampipe.run import record
-from bampipe.run.verify import verify
+from bampipe.run.status import verify
 from bampipe.stages import base
 
 PIPELINE = """

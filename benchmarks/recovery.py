@@ -38,7 +38,7 @@ from bampipe.files import write_text
 from bampipe.progress import silent
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.intervals import NORMAL_95
+from bampipe.results.rounding import NORMAL_95
 from bampipe.results.validate import ValidateResult
 from bampipe.run import models
 from bampipe.stages import filter as filter_stage

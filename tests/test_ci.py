@@ -24,9 +24,9 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.run import GateVerdict
 from bampipe.results.validate import ValidateResult
 from bampipe.run import accepted, gates, models, pipeline
-from bampipe.run.markdown import summary
 from bampipe.run.request import Outcome, Request
 from bampipe.run.state import RunState
+from bampipe.run.summaries import markdown
 
 ROOT = Path(__file__).parent.parent
 CHANGE = Gate(
@@ -203,7 +203,7 @@ def test_the_summary_is_a_table_that_no_text_breaks(tmp_path: Path) -> None:
     root = made(tmp_path / "runs/s1", mass=2.0)
     axes = {"yaw": {"held_out_rmse": 0.2, "noise_floor": 0.1}}
     write_result(root, ValidateResult, axes=axes)
-    text = summary(
+    text = markdown(
         [
             Outcome(root, "done", (), (bad,), model="base"),
             Outcome(tmp_path / "s2", "refused", error="t1.csv, row 3: not a number"),

@@ -19,7 +19,8 @@ from pathlib import Path
 import pytest
 from conftest import Command
 
-from bampipe.run.settings import configure, parse_assignment
+from bampipe.cli.one_stage import parse_settings
+from bampipe.run.state import configure
 from bampipe.stages import base
 
 ROOT = Path(__file__).parent.parent
@@ -74,8 +75,7 @@ def check(line: str) -> None:
         assert left_out or "requires an argument" in str(error), f"{line}: {error}"
         return
     stage = name.removeprefix("bampipe ")
-    for text in context.params.get("settings") or ():
-        key, value = parse_assignment(text)
+    for key, value in parse_settings(context.params.get("settings")).items():
         if stage == "run":
             configure(key.partition(".")[0], {key.partition(".")[2]: value})
         elif stage in base.STAGES:

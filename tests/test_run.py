@@ -11,6 +11,7 @@ import pytest
 from conftest import Toy, contents
 from made_results import write_result
 
+from bampipe.cli.one_stage import parse_settings
 from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
@@ -21,9 +22,8 @@ from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome
 from bampipe.run.runner import run_session
 from bampipe.run.session_name import session_id
-from bampipe.run.settings import configure, parse_assignment
-from bampipe.run.status import status
-from bampipe.run.verify import verify
+from bampipe.run.state import configure
+from bampipe.run.status import status, verify
 
 ALL = ["toy_read", "toy_double", "toy_fit:base", "toy_sum"]
 
@@ -443,11 +443,10 @@ def test_wrong_pipelines_are_refused(toy: Toy, old: str, new: str, message: str)
 
 
 def test_assignment() -> None:
-    assert parse_assignment("a=1") == ("a", 1)
-    assert parse_assignment("a=[1, 2]") == ("a", [1, 2])
-    assert parse_assignment("a=least-squares") == ("a", "least-squares")
+    given = {"a": 1, "b": [1, 2], "c": "least-squares"}
+    assert parse_settings(["a=1", "b=[1, 2]", "c=least-squares"]) == given
     with pytest.raises(InputError, match="not a setting"):
-        parse_assignment("a")
+        parse_settings(["a"])
 
 
 # Several sessions

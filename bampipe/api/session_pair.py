@@ -1,11 +1,10 @@
 """Comparison of two sessions of one device, and prediction of each by the model of the other."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -25,7 +24,6 @@ from bampipe.progress import Progress, silent
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
 from bampipe.results.floor import AT_FLOOR, FLOOR_SDS
 from bampipe.results.identify import BaseEstimate, IdentifyResult, ParameterEstimate
-from bampipe.results.intervals import NORMAL_95
 from bampipe.results.pair import (
     FAMILY_ERROR,
     Journey,
@@ -36,6 +34,7 @@ from bampipe.results.pair import (
     StateChange,
     Travel,
 )
+from bampipe.results.rounding import NORMAL_95
 from bampipe.results.validate import ValidateResult
 from bampipe.run import models
 from bampipe.trials.linearisation import Linearisation, linearise_fit
@@ -62,7 +61,7 @@ class _Side:
     validated: ValidateResult
 
     @classmethod
-    def read(cls, root: Path, name: str, model: str) -> _Side:
+    def read(cls, root: Path, name: str, model: str) -> Self:
         run, model = RunFolder(root), models.choose_model(root, model)
         found, validated = run.read(IdentifyResult, model), run.read(ValidateResult, model)
         system = compile_model(load_model(run, model))
@@ -73,7 +72,7 @@ class _Side:
     def effects(self) -> tuple[str, ...]:
         return tuple(effect.name for effect in self.system.model.effects)
 
-    def predict(self, other: _Side) -> Linearisation:
+    def predict(self, other: Self) -> Linearisation:
         """Evaluate this model on the trials of ``other`` without a refit."""
         trials = read_measured_trials(other.run, self.system, timing=other.found.input_timing)
         return linearise_fit(

@@ -1,7 +1,5 @@
 """``bampipe effects``: the library, and one effect in full."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -141,7 +139,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
         show.say(line)
 
 
-def parameter_rows(effect: Effect) -> Iterator[list[object]]:
+def parameter_rows(effect: "Effect") -> Iterator[list[object]]:
     """Name, kind of axis, unit, numbers and description of each parameter."""
     from bampipe.physics.effect import ParameterByKind
 

@@ -43,7 +43,7 @@ def verify_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption =
 
     Example: bampipe verify 2026-10-03_s01
     """
-    from bampipe.run.verify import verify
+    from bampipe.run.status import verify
 
     root = places.find_run(run, runs)
     found = verify(root)

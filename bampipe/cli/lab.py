@@ -1,7 +1,5 @@
 """`bampipe lab`: all runs side by side."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,7 +49,7 @@ def lab(
     show.print_advice(next(remedies, f"open {found.folder / 'report.html'}"), quiet)
 
 
-def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> Lab:
+def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> "Lab":
     """Write the lab's folder for the runs in ``runs``."""
     from bampipe.lab.collect import collect
     from bampipe.lab.folders import lab_folder
@@ -81,7 +79,7 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
         show.print_advice(f"open {found.folder / 'report.html'}, which links every session")
 
 
-def table(found: Lab) -> None:
+def table(found: "Lab") -> None:
     """Print the sessions, and the trends."""
     from bampipe.phrases import lab as phrases
 

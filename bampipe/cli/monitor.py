@@ -1,7 +1,5 @@
 """`bampipe monitor`: the filter on samples as they arrive."""
 
-from __future__ import annotations
-
 import json as json_text
 import os
 import sys
@@ -112,7 +110,7 @@ def monitor(
             os.close(stream.descriptor)
 
 
-def follow(stream: SampleStream, watch: Monitor, output: _Output, wait: bool) -> None:
+def follow(stream: "SampleStream", watch: "Monitor", output: "_Output", wait: bool) -> None:
     """Filter the stream to its end, or if ``wait``, until the user stops it."""
     try:
         while True:
@@ -135,12 +133,12 @@ def follow(stream: SampleStream, watch: Monitor, output: _Output, wait: bool) ->
 class _Output:
     """Write a JSON line per interval of data, or on a terminal a table a few times a second."""
 
-    def __init__(self, screen: Live | None, every: float) -> None:
+    def __init__(self, screen: "Live | None", every: float) -> None:
         self._every, self._next, self._drawn = every, -float("inf"), 0.0
         self._alarm = False
         self._screen = screen
 
-    def show(self, watch: Monitor, stream: SampleStream, final: bool = False) -> None:
+    def show(self, watch: "Monitor", stream: "SampleStream", final: bool = False) -> None:
         """Show the current state if it is time to."""
         if self._screen:
             if final or time.monotonic() - self._drawn > SCREEN_S:

@@ -1,15 +1,16 @@
 """One stage of a run as a command: its settings, its result, the next command."""
 
-from __future__ import annotations
-
 import inspect
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bampipe.cli import places, show
 from bampipe.cli.options import StageOptions
+from bampipe.errors import InputError
 from bampipe.stages import base
 
 if TYPE_CHECKING:
@@ -51,10 +52,20 @@ def stage_command(stage: str) -> Callable[[Callable[..., None]], Callable[..., N
 
 
 def parse_settings(given: Sequence[str] | None) -> dict[str, object]:
-    """Return the settings ``NAME=VALUE`` by name."""
-    from bampipe.run.settings import parse_assignment
+    """Return the settings ``NAME=VALUE`` by name; a value is read as TOML, or else as text.
 
-    return dict(parse_assignment(text) for text in given or ())
+    Raises:
+        InputError: there is no ``=``.
+    """
+    found: dict[str, object] = {}
+    for text in given or ():
+        name, sign, value = text.partition("=")
+        if not sign or not name.strip():
+            raise InputError(f"{text!r} is not a setting", remedy="write --set name=value")
+        found[name.strip()] = value
+        with suppress(tomllib.TOMLDecodeError):
+            found[name.strip()] = tomllib.loads(f"value = {value}")["value"]
+    return found
 
 
 def run_stage(
@@ -65,7 +76,7 @@ def run_stage(
     session: Path | None = None,
     model: str = "",
     more: Mapping[str, object] | None = None,
-) -> Outcome:
+) -> "Outcome":
     """Run one stage on the results of earlier ones, and print its findings.
 
     Args:
@@ -107,7 +118,7 @@ def run_stage(
     return outcome
 
 
-def _say_if_outdated(root: Path, pipeline: Pipeline, model: str) -> None:
+def _say_if_outdated(root: Path, pipeline: "Pipeline", model: str) -> None:
     """Print a note if a diagnosis that has just been used was made from other results."""
     from bampipe.run.status import status
 

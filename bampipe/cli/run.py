@@ -1,7 +1,5 @@
 """``bampipe run``: sessions from raw log to report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -128,7 +126,7 @@ def run(
         raise typer.Exit(code)
 
 
-def _advise(outcome: Outcome, runs: Path, quiet: bool, json: bool) -> None:
+def _advise(outcome: "Outcome", runs: Path, quiet: bool, json: bool) -> None:
     """Print what came of earlier proposals, and the next command."""
     from bampipe.cli.next_step import after_run, print_forecasts
 
@@ -138,7 +136,9 @@ def _advise(outcome: Outcome, runs: Path, quiet: bool, json: bool) -> None:
     show.print_advice(command.replace("RUN", places.next_to(outcome.root, runs)), quiet, json)
 
 
-def _make_requests(common: Request, folders: Sequence[Path]) -> tuple[list[Request], list[Outcome]]:
+def _make_requests(
+    common: "Request", folders: Sequence[Path]
+) -> "tuple[list[Request], list[Outcome]]":
     """Return a request for each session folder, and an outcome for each that is refused.
 
     Args:
@@ -181,16 +181,16 @@ def _split_settings(given: Sequence[str] | None) -> dict[str, dict[str, object]]
 
 
 def _write_summaries(
-    outcomes: Sequence[Outcome], junit: Path | None, markdown: Path | None
+    outcomes: "Sequence[Outcome]", junit: Path | None, markdown: Path | None
 ) -> None:
     """Write the verdicts of the gates as JUnit XML, and add a summary in Markdown, where asked."""
-    from bampipe.run import junit as junit_xml
-    from bampipe.run.markdown import summary
+    from bampipe.run import summaries
 
     for path, mode in ((junit, "wb"), (markdown, "ab")):
         if path is None:
             continue
-        content = junit_xml.junit(outcomes) if path is junit else summary(outcomes).encode()
+        xml = path is junit
+        content = summaries.junit(outcomes) if xml else summaries.markdown(outcomes).encode()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open(mode) as stream:
@@ -199,7 +199,7 @@ def _write_summaries(
             raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
 
-def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None:
+def _report_runs(outcomes: "Sequence[Outcome]", several: bool, json: bool) -> None:
     for outcome in outcomes:
         if outcome.traceback:
             show.note(outcome.traceback)

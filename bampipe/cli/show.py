@@ -1,7 +1,5 @@
 """Output of the commands: results on standard output, progress and errors on standard error."""
 
-from __future__ import annotations
-
 import json
 import sys
 import threading
@@ -9,7 +7,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from bampipe.errors import InputError, printable
 from bampipe.progress import Progress
@@ -192,7 +190,7 @@ def _print_trials(content: Mapping[str, object]) -> None:
             say(f"{word}: {len(rows) - MOST_TRIALS} trials more; `bampipe ingest --json` lists all")
 
 
-def _print_ladder(rungs: Sequence[Rung]) -> None:
+def _print_ladder(rungs: "Sequence[Rung]") -> None:
     """Print one row a model version: its held-out error over the noise floor, axis by axis."""
     axes = list(dict.fromkeys(axis for rung in rungs for axis in rung.held_out_rmse))
     rows = []
@@ -224,7 +222,7 @@ def print_block(table: Table) -> None:
         say(table.note)
 
 
-def print_outcome(result: Outcome) -> None:
+def print_outcome(result: "Outcome") -> None:
     """Print the steps of a run and its gates, after the mistakes of the set-up."""
     for step in result.steps:
         _print_lines(step.summary, "setup", "set-up")
@@ -252,7 +250,7 @@ def print_outcome(result: Outcome) -> None:
         _print_model(result.model)
 
 
-def print_unidentified(effects: Mapping[str, EffectEstimate]) -> None:
+def print_unidentified(effects: "Mapping[str, EffectEstimate]") -> None:
     """Print which effects of a model do not count as identified, and why."""
     from bampipe.phrases.results import describe_unidentified
 
@@ -292,7 +290,7 @@ class Watcher:
         self.written: dict[str, float] = {}
         self.lock, self.over = threading.Lock(), threading.Event()
 
-    def __enter__(self) -> Watcher:
+    def __enter__(self) -> Self:
         if not self.quiet and sys.stderr.isatty():
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn

@@ -1,7 +1,5 @@
 """Export of an identified model to formats that other programs read."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -109,7 +107,7 @@ def _mjcf(run: RunFolder, system: System, p: Array) -> str:
     return mjcf_text(system.model.device.name, tree.flat, robot.gravity, comment, add)
 
 
-def _head(tree: _IdentifiedTree, lacks: Sequence[str]) -> str:
+def _head(tree: "_IdentifiedTree", lacks: Sequence[str]) -> str:
     """Describe the origin of a model, moved masses, and the parts that the text lacks."""
     parts = ["identified by bampipe", *tree.notes]
     return "; ".join([*parts, f"not in it: {', '.join(lacks)}"] if lacks else parts)

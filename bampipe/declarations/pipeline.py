@@ -1,9 +1,7 @@
 """Pipeline files: stages to run, their settings, and limits for the results."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, PrivateAttr, StringConstraints
 
@@ -104,6 +102,6 @@ class Pipeline(Declaration):
         """Device and effects of the base model."""
         return self.model.device, self.model.effects
 
-    def with_every_stage(self) -> Pipeline:
+    def with_every_stage(self) -> Self:
         """Return the pipeline for single stages: with its settings, but with every stage."""
         return self.model_copy(update={"stages": base.STAGES})

@@ -4,9 +4,8 @@ Relevant lengths, speeds and times differ by a factor of a thousand between mach
 ranges follow the travel, speeds, loads and sampling of the trials.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -131,7 +130,7 @@ class MachineScale:
     band_hz: tuple[float, ...]
 
     @classmethod
-    def of_trials(cls, linearisation: Linearisation) -> MachineScale:
+    def of_trials(cls, linearisation: Linearisation) -> Self:
         """Return the scale of the trials of ``linearisation``."""
         system, q, qd, load = linearisation.system, [], [], []
         for trial, motion in enumerate(linearisation.motions):

@@ -1,7 +1,5 @@
 """The search over sets of effects, with shapes refined and strengths within their bounds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 

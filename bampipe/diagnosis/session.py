@@ -1,7 +1,5 @@
 """The trials of a session, fits of models under the likelihood, and their replicates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -237,7 +235,7 @@ class Session:
 
     def fit(
         self, spec: ModelSpec, start: Array, noise: Noise | None = None, lacking: float = np.inf
-    ) -> Fit:
+    ) -> "Fit":
         """Fit a model under the likelihood.
 
         Args:
@@ -303,7 +301,7 @@ class Session:
             damping = 0.1 * damping if damping > _LEAST_DAMPING else 0.0
         return linearisation, problem
 
-    def judge(self, spec: ModelSpec, p: Array, count: int = 0) -> Fit:
+    def judge(self, spec: ModelSpec, p: Array, count: int = 0) -> "Fit":
         """Compare a given model with ``count`` replicates on the trials that judge it.
 
         Raises:
@@ -315,7 +313,7 @@ class Session:
             spec, linearisation, likelihood, pose_problem(likelihood, linearisation), is_given=True
         )
 
-    def fit_plainly(self, spec: ModelSpec, start: Array) -> Fit:
+    def fit_plainly(self, spec: ModelSpec, start: Array) -> "Fit":
         """Fit a model with equal noise for all samples of an axis, without replicates."""
         linearisation = self.linearise(spec, start)
         samples = lay_out_samples(linearisation, self.criteria.block_s)
@@ -326,7 +324,7 @@ class Session:
         linearisation, problem = self._descend(spec, linearisation, flat)
         return Fit(spec, linearisation, flat, problem)
 
-    def try_fit(self, spec: ModelSpec, start: Array) -> Fit | None:
+    def try_fit(self, spec: ModelSpec, start: Array) -> "Fit | None":
         """Apply `fit`; None if the model cannot be simulated or its residual is not finite."""
         try:
             return self.fit(spec, start)

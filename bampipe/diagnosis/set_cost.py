@@ -4,8 +4,6 @@ The terms are those of docs/method_selection.md: misfit, change of variables, Oc
 of the strengths and of the set. Strengths stay within their bounds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace

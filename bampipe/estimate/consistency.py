@@ -7,8 +7,6 @@ If some windows are known to be good, a gamma distribution with their mean and v
 used, of which chi-squared is a special case.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,12 +33,12 @@ class Reference:
     scale: float
 
     @staticmethod
-    def of_theory(readings: int) -> Reference:
+    def of_theory(readings: int) -> "Reference":
         """Chi-squared with ``readings`` degrees of freedom, over ``readings``."""
         return Reference(readings / 2.0, 2.0 / readings)
 
     @staticmethod
-    def of_windows(means: Array, readings: int) -> Reference:
+    def of_windows(means: Array, readings: int) -> "Reference":
         """Fit the distribution to good windows; fewer than `FEWEST_WINDOWS` give `of_theory`.
 
         Args:

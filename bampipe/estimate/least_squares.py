@@ -8,8 +8,6 @@ parameter, passes one zero-phase low-pass and is thinned to nearly independent s
 This module depends only on arrays and callables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -149,7 +147,7 @@ def minimise(
     most_iterations: int = 30,
     *,
     tolerance: float = 1e-10,
-) -> Linearised:
+) -> "Linearised":
     """Minimise the sum of squares, weighted by axis, over the free parameters within bounds.
 
     Each axis is weighted by the scatter of its own residual, iteratively. If the residual is
@@ -220,7 +218,7 @@ class Linearised:
             moment -= slope.T @ (s.residual * weight).reshape(-1)
         return normal, moment
 
-    def moved(self, value: Array) -> Linearised:
+    def moved(self, value: Array) -> "Linearised":
         """Return the trials linearised at the free parameters ``value``, (n_free,)."""
         p = self.p.copy()
         p[self.problem.free] = value

@@ -4,10 +4,9 @@ A residual r + X b, linear in b, enters through X'X, X'r and r'r of every trial 
 of trials, with any weights of the axes and any bounds, is then solved without access to a sample.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -43,7 +42,7 @@ class NormalEquations:
         used: Sequence[Flags],
         precision: Array,
         known: Array,
-    ) -> NormalEquations:
+    ) -> Self:
         """Sum over the samples of each trial.
 
         Args:
@@ -64,7 +63,7 @@ class NormalEquations:
         prior = [np.append(part, free) for part in (precision, known)]
         return cls(np.array(xx), np.array(xy), np.array(yy), count, *prior)
 
-    def subset(self, trials: Sequence[int]) -> NormalEquations:
+    def subset(self, trials: Sequence[int]) -> "NormalEquations":
         """The sums of some trials."""
         chosen = list(trials)
         return NormalEquations(

@@ -14,8 +14,6 @@ positive value although the truth is zero. Other bounds always hold, by clamping
 mean.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -152,7 +150,7 @@ class Trial:
         """(T, nu) second time derivatives of the inputs, zero for linear interpolation."""
         return np.zeros(self.u.shape) if self.curvature is None else self.curvature
 
-    def first(self, samples: int) -> Trial:
+    def first(self, samples: int) -> "Trial":
         """The trial, cut to at most so many samples."""
         return replace(
             self, t=self.t[:samples], u=self.u[:samples], y=self.y[:samples],

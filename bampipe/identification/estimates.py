@@ -26,8 +26,7 @@ from bampipe.results.identify import (
     ParameterEstimate,
     WorstSecond,
 )
-from bampipe.results.intervals import NORMAL_95
-from bampipe.results.rounding import round_with_sd
+from bampipe.results.rounding import NORMAL_95, round_with_sd
 
 MOST_SHOWN = 24
 """Largest number of parameters in a headline."""

@@ -1,7 +1,5 @@
 """The unscented filter's estimate: noise levels, pass over all trials, sign width, intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -182,7 +180,7 @@ class Filtering:
             report_progress=lambda done, name: self.report_progress(0.35 + 0.6 * done, name),
         )
 
-    def find(self) -> tuple[FilterRun, _Width | None, _Widths]:
+    def find(self) -> "tuple[FilterRun, _Width | None, _Widths]":
         """Return the run to publish, the narrower sign width if chosen, and the widths compared."""
         found = self.run(self.attempts, self.settings)
         widths = _Widths(self, found)
@@ -262,7 +260,7 @@ def estimate_by_filter(filtering: Filtering) -> Estimate:
     )
 
 
-def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array]:
+def _find_smoothing(width: "_Width | None", widths: "_Widths") -> tuple[Array, Array]:
     """Return the bias due to smoothing, and the spread between likely widths, both (nt,).
 
     A machine with dry friction truly stands still, whereas the model creeps within the width of its
@@ -280,7 +278,7 @@ def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array
 
 
 def _describe_smoothing(
-    names: Sequence[str], smoothing: Array, sd: Array, width: _Width | None
+    names: Sequence[str], smoothing: Array, sd: Array, width: "_Width | None"
 ) -> tuple[str, ...]:
     """Describe a narrower sign, and parameters whose uncertainty is mostly due to smoothing."""
     said = []

@@ -12,7 +12,7 @@ from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.results.identify import Covariance
-from bampipe.results.intervals import NORMAL_95
+from bampipe.results.rounding import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
 from bampipe.trials.comparison import ComparedTrial
 from bampipe.trials.measured import MeasuredTrials

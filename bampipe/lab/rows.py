@@ -12,7 +12,7 @@ from bampipe.phrases import diagnosis as phrases
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.intervals import NORMAL_95
+from bampipe.results.rounding import NORMAL_95
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
 from bampipe.run import models, record

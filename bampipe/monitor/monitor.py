@@ -13,7 +13,7 @@ from bampipe.estimate.online import OnlineFilter
 from bampipe.estimate.unscented import FilterFailure
 from bampipe.monitor.start import FIRST_LOOK, MonitorOptions, Start, start_from_samples
 from bampipe.physics import System
-from bampipe.results.intervals import NORMAL_95
+from bampipe.results.rounding import NORMAL_95
 
 PORTION = 512
 """Samples filtered at once, which bounds the memory."""

@@ -1,7 +1,5 @@
 """Discrimination of alternative effects by trials: the error of the wrong one after a refit."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
@@ -68,10 +66,10 @@ class Sums:
     added: Array
     applied: Array
 
-    def __add__(self, other: Sums) -> Sums:
+    def __add__(self, other: "Sums") -> "Sums":
         return Sums(*map(add, vars(self).values(), vars(other).values()))
 
-    def scale_by(self, factor: float) -> Sums:
+    def scale_by(self, factor: float) -> "Sums":
         """Return the sums of trials that are ``factor`` times as long."""
         return Sums(*(factor * values for values in vars(self).values()))
 

@@ -1,7 +1,5 @@
 """A plan: trials, chosen one by one, that bring every uncertainty below its goal."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -49,7 +47,7 @@ class _Option:
     information: Array
     sums: Sums | None
 
-    def scale_to(self, seconds: float) -> _Option:
+    def scale_to(self, seconds: float) -> "_Option":
         """Return the option at another length: information is proportional to time."""
         share = seconds / self.design.seconds
         return _Option(

@@ -1,9 +1,8 @@
 """The gain of a further trial for the parameters: information and remaining uncertainty."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -74,7 +73,7 @@ class Precision:
         p: Array,
         identified: IdentifyResult,
         noise: FilterSettings,
-    ) -> Precision:
+    ) -> Self:
         """Return the precision that the trials at hand give.
 
         The uncertainty is that of a regression in the coloured noise of the sensors, whatever

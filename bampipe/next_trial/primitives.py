@@ -1,9 +1,8 @@
 """Trials that a person can record: strokes of some axes, within the limits of both."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -79,10 +78,10 @@ class Envelope:
     acceleration: Array
     field: Array
     levels: Mapping[str, tuple[float, float, float]]
-    wider: Envelope | None = None
+    wider: "Envelope | None" = None
 
     @classmethod
-    def of_trials(cls, motions: Sequence[Motion], system: System, p: Array) -> Envelope:
+    def of_trials(cls, motions: Sequence[Motion], system: System, p: Array) -> Self:
         """Return the envelope of the trials at hand, for a model with parameters ``p`` (n_p,)."""
         device = system.model.device
         axes = [c.name for c in device.coordinates]
@@ -106,7 +105,7 @@ class Envelope:
         )  # fmt: skip
         return seen.widen(bounds, _find_speed_limits(motions, system, p))
 
-    def widen(self, bounds: Array, speeds: Array) -> Envelope:
+    def widen(self, bounds: Array, speeds: Array) -> Self:
         """Return the envelope with a wider one within the limits of the device.
 
         ``bounds`` (n_q, 2) of the range are infinite, and ``speeds`` (n_q,) NaN, if not stated. The
@@ -252,7 +251,7 @@ class Series:
         bend = 420.0 * (u * (1.0 - u)) ** 2 * (1.0 - 2.0 * u) / self.ramp_s**2
         return (self.middle + size * x, size * v + rate * x, size * a + 2.0 * rate * v + bend * x)
 
-    def scale_by(self, share: Array | float) -> Series:
+    def scale_by(self, share: Array | float) -> Self:
         """Return the series with all amplitudes times ``share``, a number or one for each axis."""
         return replace(self, sine=share * self.sine, cosine=share * self.cosine)
 

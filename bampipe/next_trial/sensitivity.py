@@ -1,7 +1,5 @@
 """Smallest strength of each effect that a diagnosis of the present trials would have found."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -167,7 +165,7 @@ class Detectability:
     limits: tuple[DetectionLimit, ...]
     needed: float
 
-    def keep_hidden(self, most: int) -> Detectability:
+    def keep_hidden(self, most: int) -> "Detectability":
         """Return the same for the effects that go unnoticed at their typical size, worst first."""
         hidden = [one for one in self.limits if one.factor > 1.0]
         limits = tuple(sorted(hidden, key=lambda one: -one.factor)[:most])

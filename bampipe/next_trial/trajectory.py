@@ -4,12 +4,10 @@ Source: Swevers, Ganseman, Tükel, de Schutter and Van Brussel 1997, Optimal rob
 identification.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -165,7 +163,7 @@ class Points:
     columns: tuple[Array, Array, Array, Array]
 
     @classmethod
-    def of_series(cls, series: Series, rehearsal: Rehearsal) -> Points:
+    def of_series(cls, series: Series, rehearsal: Rehearsal) -> Self:
         """Return `HZ` points per second, and one at the end, where the motion rests again."""
         t = np.linspace(0.0, series.seconds, round(series.seconds * HZ) + 1)
         clock, effort = rehearsal.effort(series)

@@ -63,9 +63,9 @@ def split_sets(
     return [n for n in sets[0][0] if n in known and all(n in names for names, _ in sets)], sets
 
 
-def name_set(one: WeighedSet, mark: str = "") -> str:
-    """Return the effects of a set and what is unknown beside them; ``mark`` on either side."""
-    names = [f"{mark}{name}{mark}" for name in one.effects]
+def name_set(one: WeighedSet) -> str:
+    """Return the effects of a set, each in backticks, and what is unknown beside them."""
+    names = [f"`{name}`" for name in one.effects]
     beside = [f"{UNKNOWN} on {one.unknown}"] if one.unknown else []
     return join_names(names + beside) or "none"
 

@@ -5,8 +5,7 @@ from collections.abc import Iterator, Mapping
 from bampipe.results.floor import FLOOR_WRONG, FloorStatus
 from bampipe.results.identify import EffectEstimate, IdentifyResult, Method
 from bampipe.results.ingest import DeadStretch, IngestResult, MainsHum
-from bampipe.results.intervals import NORMAL_95
-from bampipe.results.rounding import round_with_sd
+from bampipe.results.rounding import NORMAL_95, round_with_sd
 from bampipe.results.setup import SetupResult
 from bampipe.results.validate import JudgedError
 

@@ -1,7 +1,5 @@
 """A model as plain data."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from copy import deepcopy
@@ -28,7 +26,7 @@ class ModelSpec:
     effects: tuple[str, ...]
     extra: tuple[Mapping[str, Any], ...]
 
-    def with_sign_widths(self, factor: float) -> ModelSpec:
+    def with_sign_widths(self, factor: float) -> "ModelSpec":
         """Return the model with signs of velocities smoothed over ``factor`` times the width."""
         declaration = deepcopy(dict(self.device))
         for coordinate in device_from(self.device).coordinates:

@@ -8,8 +8,6 @@ Gravity enters as an acceleration of the base (Luh, Walker and Paul 1980). Vecto
 matrices (3, 3, m), of m samples, or of one where all are equal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A parameter of a model: its unit, prior and bounds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
@@ -64,7 +62,7 @@ class Parameter(NamedDeclaration):
         """Whether it shapes an effect instead of scaling it, so that it is meaningless at zero."""
         return not self.strength and not self.fixed
 
-    def renamed(self, name: str, **changes: object) -> Parameter:
+    def renamed(self, name: str, **changes: object) -> "Parameter":
         """Return the parameter under its full name in a model, with other fields."""
         copy = self.model_copy(update=changes)
         copy._name = name

@@ -1,7 +1,5 @@
 """A robot: joints in a row or in a tree, each with the body behind it, in place of energies."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The acting part of each logged input, after the effects between log and mechanism."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, get_args
@@ -68,7 +66,7 @@ class ActingInputs:
         rates, initial: of the internal states of the effects between, by symbol.
     """
 
-    def __init__(self, d: Vocabulary, effects: Iterable[BoundEffect]) -> None:
+    def __init__(self, d: "Vocabulary", effects: Iterable[BoundEffect]) -> None:
         """Chain the effects of kind ``input`` among ``effects``: those of the model, or some."""
         self._d, device = d, d.model.device
         self.logged = d.table(device.applied, "applied")

@@ -8,8 +8,6 @@ A number in an expression is pure if it is a multiple of one quarter; any other 
 that the text does not show, and is let pass. Give such a number a name and a unit instead.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -29,14 +27,14 @@ class Dimension:
 
     exponents: tuple[Fraction, ...] = (Fraction(0),) * len(BASE)
 
-    def __mul__(self, other: Dimension) -> Dimension:
+    def __mul__(self, other: "Dimension") -> "Dimension":
         pairs = zip(self.exponents, other.exponents, strict=True)
         return Dimension(tuple(a + b for a, b in pairs))
 
-    def __truediv__(self, other: Dimension) -> Dimension:
+    def __truediv__(self, other: "Dimension") -> "Dimension":
         return self * other**-1
 
-    def __pow__(self, power: Fraction | int) -> Dimension:
+    def __pow__(self, power: Fraction | int) -> "Dimension":
         return Dimension(tuple(e * power for e in self.exponents))
 
     def __str__(self) -> str:

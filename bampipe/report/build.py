@@ -1,12 +1,11 @@
 """From a run folder to the report's files."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Self
 
 from bampipe.files import atomic_writer, write_text
 from bampipe.report import page, style, typeset
@@ -34,7 +33,7 @@ class Report:
     sections: tuple[str, ...]
 
     @classmethod
-    def from_document(cls, document: Document, recorded: int, explorer: str = "") -> Report:
+    def from_document(cls, document: Document, recorded: int, explorer: str = "") -> Self:
         """Return the files of ``document``; see `typeset.render_pdf` for ``recorded``."""
         blocks = (block for section in document.sections for block in section.blocks)
         figures = {block.name: block.svg for block in blocks if isinstance(block, Figure)}

@@ -4,12 +4,10 @@ Text may hold three kinds of inline mark: ``**strong**``, code between backticks
 a page of our own, ``[words](../s01/report/report.html)``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from bampipe.report.wording import NONE, format_entry, format_prose
 
@@ -127,7 +125,7 @@ class Table:
             if one
         ]
 
-    def drop_empty_columns(self) -> Table:
+    def drop_empty_columns(self) -> Self:
         """Return the table without the columns that say nothing in any row."""
         titles = self.columns.split(" | ")
         full = [k for k in range(len(titles)) if {row[k] for row in self.rows} - {"", NONE}]
@@ -161,7 +159,7 @@ class Section:
     blocks: tuple[Block, ...]
 
     @classmethod
-    def gather(cls, title: str, blocks: Iterable[Block | None]) -> Section:
+    def gather(cls, title: str, blocks: Iterable[Block | None]) -> Self:
         """Return a section of the ``blocks`` that say something: no empty text, list or table."""
         full = (b for b in blocks if b and not (isinstance(b, Table) and not b.rows))
         return cls(title, tuple(full))

@@ -19,7 +19,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from bampipe.report import document
 from bampipe.report.wording import break_lines, choose_scale, format_unit, split_name
-from bampipe.results.intervals import NORMAL_95
+from bampipe.results.rounding import NORMAL_95
 
 COLOURS = {
     "ink": "#1c2024", "faint": "#b4b8bd", "blue": "#0072b2", "vermillion": "#d55e00",

@@ -1,10 +1,8 @@
 """``compare.json``: the ladder of model versions on the same held-out trials."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field
 
@@ -42,7 +40,7 @@ class Rung(Record):
         found = self.drift.get(axis)
         return {h.horizon_s: h.median for h in found.horizons} if found else {}
 
-    def improves_on(self, other: Rung) -> bool:
+    def improves_on(self, other: Self) -> bool:
         """Return whether its held-out error is lower and can still be judged.
 
         A version that has lost its noise floor is no better, whatever its error: its replicates
@@ -50,12 +48,12 @@ class Rung(Record):
         """
         return self.has_lower_error_than(other) and not self.has_lost_its_floor(other)
 
-    def has_lower_error_than(self, other: Rung) -> bool:
+    def has_lower_error_than(self, other: Self) -> bool:
         """Whether the held-out error, as the product over the axes, is noticeably lower."""
         ratios = (self.held_out_rmse[a] / max(e, 1e-300) for a, e in other.held_out_rmse.items())
         return math.prod(ratios) < 1.0 - NOTICEABLE
 
-    def has_lost_its_floor(self, other: Rung) -> bool:
+    def has_lost_its_floor(self, other: Self) -> bool:
         """Whether its error has no floor on an axis where that of ``other`` has one."""
         axes = other.noise_floor
         return any(self._floor_is_wrong(a) and not other._floor_is_wrong(a) for a in axes)

@@ -1,7 +1,9 @@
-"""Numbers rounded to their uncertainty, for sentences in results."""
+"""Numbers and their uncertainty: intervals, and rounding for sentences in results."""
 
 import math
 
+NORMAL_95 = 1.959964
+"""Standard deviations on either side that hold 95 % of a normal distribution."""
 _MOST_DECIMALS = 9
 SMALLEST_PLAIN, _LARGEST_PLAIN = 1e-4, 1e7
 """Range in which a number is written without a power of ten."""

@@ -5,8 +5,6 @@ worker sees under the same path. If only the sessions do, ``publish`` of a reque
 finished run folders elsewhere (see :mod:`bampipe.run.publish`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import threading
@@ -82,7 +80,7 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
     return [outcomes[number] for number in range(len(requests))]
 
 
-def _connect(scheduler: str) -> Client:
+def _connect(scheduler: str) -> "Client":
     """Return a client of the scheduler at this address.
 
     Raises:
@@ -124,7 +122,7 @@ def _within(seconds: float, call: Callable[[], Answer]) -> Answer:
 class _Watch:
     """Checks periodically that the scheduler answers and has workers."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: "Client") -> None:
         self._client = client
         self._asked = self._manned = time.monotonic()
 

@@ -16,20 +16,8 @@ from bampipe.stages import base
 PACKAGES = ("h5py", "matplotlib", "numba", "numpy", "pandas", "pyarrow", "scipy", "sympy", "typst")
 """Packages whose version may change a result."""
 
-SHARED_CODE = (
-    "physics",
-    "estimate",
-    "results",
-    "phrases",
-    "data",
-    "declarations",
-    "trials",
-    "setup",
-    "identification",
-    "diagnosis",
-    "next_trial",
-)
-"""Sub-packages that stages call, beside single files; a change in one reruns every stage."""
+_OUTER = ("api", "cli", "lab", "monitor", "report", "run", "simulator", "stages")
+"""Sub-packages that no stage calls; a change in another or in a single file reruns every stage."""
 
 ABSENT = "absent"
 
@@ -87,7 +75,8 @@ def _digest_tree(root: Path) -> str:
 def digest_code(stage: str) -> str:
     """Return the hash of the source that ``stage`` may call, without importing it."""
     package = Path(bampipe.__file__).parent
-    parts = [package / name for name in SHARED_CODE]
+    rooms = (path.parent for path in sorted(package.glob("*/__init__.py")))
+    parts = [room for room in rooms if room.name not in _OUTER]
     parts += [*sorted(package.glob("*.py")), package / "stages/base.py"]
     if stage in base.PRINTING:
         parts.append(package / "report")

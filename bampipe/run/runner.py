@@ -13,8 +13,7 @@ from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.gates import judge_gates
 from bampipe.run.request import Outcome, Request, Step, StepResult, select_stages
-from bampipe.run.settings import list_lasting
-from bampipe.run.state import FIRST_TIME, RunState
+from bampipe.run.state import FIRST_TIME, RunState, list_lasting
 from bampipe.stages import base
 
 

@@ -1,5 +1,6 @@
 """State of a run folder: its record, the dependencies of each step, and which must run again."""
 
+import dataclasses
 import platform
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,11 +12,40 @@ from bampipe.files import digest_content, digest_file, digest_input
 from bampipe.results.run import SESSION
 from bampipe.run import hashing, models, record
 from bampipe.run.request import Request, Step
-from bampipe.run.settings import configure, list_lasting
+from bampipe.schema import refusal
 from bampipe.stages import base
 
 FIRST_TIME = "never run"
 """Reason of a step without a result."""
+_NEUTRAL = ("session", "jobs")
+"""Fields of a configuration that affect no result: a place, and a number of processes."""
+
+
+def configure(stage: str, settings: Mapping[str, object], where: str = "") -> Any:
+    """Return the configuration of ``stage`` with ``settings`` in place of the defaults.
+
+    Settings are as TOML or the command line gives them; ``where`` names their file in messages.
+
+    Raises:
+        InputError: an unknown field, a value of the wrong type, or one the stage refuses.
+    """
+    from pydantic import ValidationError
+
+    kind = base.load_stage(stage).Config
+    try:
+        return kind(**settings)
+    except ValidationError as error:
+        inside = ("settings", stage) if where else (stage,)
+        raise refusal(error, kind, where, inside) from None
+
+
+def list_lasting(config: Any) -> dict[str, object]:
+    """Return the fields of a configuration that affect a result, as JSON can hold them."""
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in dataclasses.asdict(config).items()
+        if name not in _NEUTRAL
+    }
 
 
 class RunState:

@@ -162,26 +162,22 @@ def _result(
 ) -> DiagnoseResult:
     found, given = conclude(session, selection), selection.initial.linearisation
     names = given.system.coordinates
-    ranking = found.ranking
     own = {effect.name: effect for effect in map(effect_from, spec.extra)}
-    known = sorted({entry.effect.partition(":")[0] for entry in ranking[:_DESCRIBED]})
+    known = sorted({entry.effect.partition(":")[0] for entry in found.ranking[:_DESCRIBED]})
     maps = {}
     for i, axis in enumerate(names):
         known_here = variables(given.fitted, given.band, i)
         maps[axis] = {one.name: residual_map(given, i, one) for one in known_here}
-    result = DiagnoseResult(
+    result = DiagnoseResult.of(
+        found,
+        selection,
         model=config.model,
         trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in session.trials.weighed)),
         axes=dict(zip(names, found.axes, strict=True)),
-        ranking=ranking,
         descriptions={
             name: EffectText.of(own.get(name) or registry.effect(name)) for name in known
         },
-        selected=found.selected,
         fitted=selection.final.effect_parameters,
-        sets=found.sets,
-        chance=found.chance,
-        cut_short=selection.cut_short,
         suggested_trial=None,
         maps=maps,
         worst_windows=tuple(worst_windows(given)),

@@ -30,8 +30,7 @@ from bampipe.results.draft import (
 )
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.intervals import NORMAL_95
-from bampipe.results.rounding import round_with_sd, significant
+from bampipe.results.rounding import NORMAL_95, round_with_sd, significant
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials
 

@@ -136,13 +136,26 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     records, refused = _tuning_records(samples, ids, tuple(axes), rate, config.tuning_samples)
     if not any(records.values()):
         raise _nothing_to_differentiate(run, trials, refused)
-    kinematics, about = _choose_kinematics(records, session, config)
+    chosen = {
+        axis: _choose(axis, records[axis], rate, entry.resolution, config)
+        for axis, entry in axes.items()
+    }
+    kinematics = Kinematics(
+        "kalman" if config.method == "auto" else config.method,
+        rate,
+        {axis: how for axis, (how, _) in chosen.items()},
+        min(config.force_cutoff_hz or _FORCE_CUTOFF_HZ, _HIGHEST_CUTOFF * rate),
+    )
     path = out / "filter/kinematics.parquet"
     written = _write_motions(path, samples, ids, kinematics, progress)
     progress(0.9, "the band of motion and force")
     system = compile_model(Model(load_device(run, session.device)))
     names = [k for k in ids if k in written.interpolated]
-    bands = _find_bands(path, names, system, session, kinematics, config)
+    # The band is that of some of the trials, spread over the session.
+    some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS_OF_BAND)).round())
+    motions = _motions(path, [names[int(k)] for k in some], system, {})
+    sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
+    bands = find_band(system, motions, sensors, kinematics, config.band_hz)
     widest = max(band.cutoff_hz for band in bands.values())
     needed = min(_CUTOFF_OVER_BAND * widest, _HIGHEST_CUTOFF * rate)
     if not config.force_cutoff_hz and widest > LEAST_HZ and needed > kinematics.input_cutoff_hz:
@@ -176,9 +189,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         sample_rate_hz=rate,
         axes={
             axis: AxisDifferentiation.of(
-                unit=axes[axis].unit, band=bands[axis], **written.median_sds(axis), **about[axis]
+                unit=entry.unit, band=bands[axis], **written.median_sds(axis), **chosen[axis][1]
             )
-            for axis in axes
+            for axis, entry in axes.items()
         },
         force=ForceFilter(derivative_cutoff_hz=kinematics.input_cutoff_hz),
         bridged_fraction=written.interpolated,
@@ -186,7 +199,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         disturbances=disturbances,
         force_offsets=offsets,
         headline=f"{kinematics.method}, {count_noun(len(written.interpolated), 'trial')}; "
-        f"bandwidth {_list_hz({axis: one['bandwidth_hz'] for axis, one in about.items()})};"
+        f"bandwidth {_list_hz({axis: one['bandwidth_hz'] for axis, (_, one) in chosen.items()})};"
         " residuals compared below "
         + _list_hz({axis: one.cutoff_hz for axis, one in bands.items()}),
     )
@@ -224,36 +237,6 @@ def _nothing_to_differentiate(
         where=str(run.root),
         remedy='record trials in which the machine moves, kind = "free" in session.toml',
     )
-
-
-def _choose_kinematics(
-    records: Mapping[str, list[tuple[Array, Flags]]], session: IngestResult, config: Config
-) -> tuple[Kinematics, dict[str, dict[str, Any]]]:
-    """Return the settings for differentiating the trials, and each axis' entry in the result."""
-    rate, filters, about = session.sample_rate_hz, {}, {}
-    for axis, entry in session.axes.items():
-        filters[axis], about[axis] = _choose(axis, records[axis], rate, entry.resolution, config)
-    method = "kalman" if config.method == "auto" else config.method
-    cutoff = min(config.force_cutoff_hz or _FORCE_CUTOFF_HZ, _HIGHEST_CUTOFF * rate)
-    return Kinematics(method, rate, filters, cutoff), about
-
-
-def _find_bands(
-    path: Path,
-    names: Sequence[str],
-    system: System,
-    session: IngestResult,
-    kinematics: Kinematics,
-    config: Config,
-) -> dict[str, ResidualBand]:
-    """Return the band of residuals of each axis, from some of the trials, spread over the session.
-
-    ``path`` holds the motions of the trials ``names``.
-    """
-    sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
-    some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS_OF_BAND)).round())
-    motions = _motions(path, [names[int(k)] for k in some], system, {})
-    return find_band(system, motions, sensors, kinematics, config.band_hz)
 
 
 def _write_motions(

@@ -45,8 +45,7 @@ from bampipe.physics.model_spec import ModelSpec
 from bampipe.progress import Progress
 from bampipe.results.identify import InputTiming
 from bampipe.results.ingest import IngestResult
-from bampipe.results.intervals import NORMAL_95
-from bampipe.results.rounding import significant
+from bampipe.results.rounding import NORMAL_95, significant
 from bampipe.schema import STRICT, Positive
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials

@@ -1,9 +1,8 @@
 """Division of trials into those to fit, groups to leave out together, and those to judge."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 HELD_OUT = -1
 """Group number of trials that the session holds out."""
@@ -29,7 +28,7 @@ class Folds:
     @classmethod
     def of_trials(
         cls, names: Sequence[str], held_out: Collection[str], fitted: Collection[str]
-    ) -> Folds:
+    ) -> Self:
         """Give each trial a group of its own, or divide them into `MOST_GROUPS` groups.
 
         The trials that the session holds out judge the model; if there are none, all do.
@@ -39,7 +38,7 @@ class Folds:
         judged = held if any(held) else [True] * len(held)
         return cls(tuple(groups), tuple(name in fitted for name in names), tuple(judged))
 
-    def subset(self, trials: Sequence[int]) -> Folds:
+    def subset(self, trials: Sequence[int]) -> "Folds":
         """The division of some of the trials, given by number."""
         return Folds(
             tuple(self.groups[k] for k in trials),

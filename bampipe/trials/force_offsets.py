@@ -5,10 +5,9 @@ the whole trial. A single offset for all trials leaves most of this error, which
 weight or friction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -99,7 +98,7 @@ class _Trial:
     @classmethod
     def of(
         cls, system: System, motion: Motion, band: Band, one: Stacked, p: Array, size: Array
-    ) -> _Trial:
+    ) -> Self:
         """Compute the coefficients of a trial from the residual and slopes of its fit."""
         rows = band.thinned_rows(motion.t.size)
         gains = system.input_map(motion.q[rows], motion.inputs(system.inputs)[rows], p)

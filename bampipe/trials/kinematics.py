@@ -4,10 +4,9 @@ Positions are differentiated by axis as ``filter/filter.json`` states. The input
 filtered; their time derivatives are band-limited.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -51,7 +50,7 @@ class Kinematics:
     input_cutoff_hz: float
 
     @classmethod
-    def from_result(cls, found: FilterResult, coordinates: Sequence[str]) -> Kinematics:
+    def from_result(cls, found: FilterResult, coordinates: Sequence[str]) -> Self:
         """The filters that ``filter/filter.json`` describes, in the order of a model's axes."""
         axes = {}
         for name in coordinates:

@@ -14,11 +14,10 @@ nuisance parameters: beta and gamma of each axis, and the input delay. The densi
 measured force: `scale` gives the change of variables from the residual.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -69,7 +68,7 @@ class Likelihood:
         bias_error: float,
         discrepancy: float,
         force_sd: Array,
-    ) -> Likelihood:
+    ) -> Self:
         """Weight samples by the noise of replicates, the error of the biases and the discrepancy.
 
         Args:
@@ -132,7 +131,7 @@ class Likelihood:
         kept = (1.0 - self.force_share[axis]) / max(scale, 1.0)
         return np.asarray(0.5 * np.log(kept + (1.0 - kept) * gain))
 
-    def with_equal_weights(self, left: Iterable[Array], lacking: float) -> Likelihood:
+    def with_equal_weights(self, left: Iterable[Array], lacking: float) -> "Likelihood":
         """Give all samples equal weight on axes where the scale of a fit exceeds ``lacking``.
 
         The noise of replicates says nothing about so large an error. The error is not noise either:
@@ -146,7 +145,7 @@ class Likelihood:
                 samples[axis] = replace(samples[axis], independent=float(rows.size))
         return replace(self, root=KeptItems(root), samples=tuple(samples))
 
-    def with_heavy_tails(self, left: Iterable[Array], tails: float) -> Likelihood:
+    def with_heavy_tails(self, left: Iterable[Array], tails: float) -> "Likelihood":
         """Reweight samples by Student's t distribution at a fit of the model.
 
         Otherwise a few fast reversals that no replicate shows would decide (Lange, Little and

@@ -1,7 +1,5 @@
 """The weighted linear problem of a linearised model under the likelihood, and its solution."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -31,7 +29,7 @@ _STEADY = 0.02
 """Relative change of the weights at convergence; the cost changes by its square."""
 
 
-def pose_problem(likelihood: Likelihood, linearisation: Linearisation) -> LinearProblem:
+def pose_problem(likelihood: Likelihood, linearisation: Linearisation) -> "LinearProblem":
     """Weight the residual and slopes of a linearised model, and add its priors."""
     samples, noise, weights = likelihood.samples, likelihood.noise, likelihood.root
     n_q = len(samples)
@@ -275,11 +273,11 @@ class LinearProblem:
         change = self.solve().base if base is None else base
         return (y + x @ change for y, x in zip(self.y, self.base, strict=True))
 
-    def solve(self) -> LinearSolution:
+    def solve(self) -> "LinearSolution":
         """The most likely change of the model's own parameters."""
         return solve_bounded(self, *self.sums())
 
-    def solve_damped(self, damping: float) -> LinearSolution:
+    def solve_damped(self, damping: float) -> "LinearSolution":
         """The most likely change by a damped step (Marquardt 1963)."""
         held = self.known_precision + damping * self.step_precision
         return replace(self, known_precision=held).solve()
@@ -289,7 +287,7 @@ class LinearProblem:
         roots = [float(np.mean(np.log(r))) if r.size else 0.0 for r in self.likelihood.root]
         return float(self.independent @ roots) - self.solve().cost
 
-    def solve_nuisance(self, count: int) -> LinearSolution:
+    def solve_nuisance(self, count: int) -> "LinearSolution":
         """The most likely nuisance parameters while the model's ``count`` parameters stay."""
         return solve_bounded(self, *self.sums(), absent=dict.fromkeys(range(count), 0.0))
 

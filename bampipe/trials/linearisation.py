@@ -1,7 +1,5 @@
 """A model fitted to the trials of a session, and its residual linearised there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property

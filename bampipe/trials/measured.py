@@ -1,7 +1,5 @@
 """The trials of a session, with the sensors, filters, band and folds behind their residuals."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -65,14 +63,14 @@ class MeasuredTrials:
             return (0.0, 0.0)
         return (-self.limit_s - self.late_s, self.limit_s - self.late_s)
 
-    def with_input_timing(self, late_s: float) -> MeasuredTrials:
+    def with_input_timing(self, late_s: float) -> "MeasuredTrials":
         """The same trials, compensated by ``late_s`` instead of `late_s`."""
         if late_s == self.late_s:
             return self
         moved = (m.with_input_timing(late_s - self.late_s) for m in self.motions)
         return replace(self, motions=KeptItems(moved, MOST_OF_TRIALS), late_s=late_s)
 
-    def subset(self, chosen: Sequence[int]) -> MeasuredTrials:
+    def subset(self, chosen: Sequence[int]) -> "MeasuredTrials":
         """Some of the trials, given by number."""
         if len(chosen) == len(self.motions):
             return self

@@ -1,7 +1,5 @@
 """A trial as recorded by its sensors, and its motion behind the session's filters."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product, takewhile
@@ -107,7 +105,7 @@ class Motion:
         u = self.inputs(system.inputs)
         return system.memory(*self.kinematics, u, p, self.t, self.parts, self._states)
 
-    def of_mechanism(self, system: System, u: Array, p: Array) -> Motion:
+    def of_mechanism(self, system: System, u: Array, p: Array) -> "Motion":
         """The motion of the mechanism, which differs from the encoder readings by `System.offset`.
 
         The offset passes the filters of the encoders: it jumps like the readings where play is
@@ -135,7 +133,7 @@ class Motion:
         self._kept["mechanism"] = offset, mechanism
         return mechanism
 
-    def rows(self, which: slice) -> Motion:
+    def rows(self, which: slice) -> "Motion":
         """The rows ``which`` of the motion, with their times."""
         return replace(
             self,
@@ -145,21 +143,21 @@ class Motion:
             parts=(slice(None),),
         )
 
-    def split(self) -> list[Motion]:
+    def split(self) -> "list[Motion]":
         """The trials of which a joined motion consists."""
         return [self.rows(part) for part in self.parts] if len(self.parts) > 1 else [self]
 
-    def with_channels(self, changed: Mapping[str, Array]) -> Motion:
+    def with_channels(self, changed: Mapping[str, Array]) -> "Motion":
         """The same motion with some channels replaced."""
         return self._share_states(replace(self, channels={**self.channels, **changed}), changed)
 
-    def _share_states(self, other: Motion, changed: Collection[str]) -> Motion:
+    def _share_states(self, other: "Motion", changed: Collection[str]) -> "Motion":
         """Pass on the cached internal states that depend on none of the ``changed`` channels."""
         alike = {key: z for key, z in self._states.items() if not {*changed} & {*key[1]}}
         other._states.update(alike)
         return other
 
-    def with_more_force(self, force: str) -> tuple[Motion, Array]:
+    def with_more_force(self, force: str) -> "tuple[Motion, Array]":
         """The same motion with a force increased by a small constant, and that constant, (T,)."""
         if force not in self._kept:
             values = self.channels[force]
@@ -170,7 +168,7 @@ class Motion:
         more, step = self._kept[force]
         return self._share_states(more, (force,)), step
 
-    def with_input_timing(self, late_s: float) -> Motion:
+    def with_input_timing(self, late_s: float) -> "Motion":
         """The same motion with inputs shifted to compensate a delay of ``late_s`` in sampling.
 
         A channel and its time derivatives are shifted by their Taylor series; a channel without

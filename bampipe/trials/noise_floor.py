@@ -1,9 +1,8 @@
 """The noise floor: the error that a model without any deficiency would have, from replicates."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -36,7 +35,7 @@ class NoiseFloor:
     replicates: int
 
     @classmethod
-    def of_errors(cls, errors: Sequence[Array]) -> NoiseFloor:
+    def of_errors(cls, errors: Sequence[Array]) -> Self:
         """Median and scatter of the errors (n_q,) of replicates."""
         found = np.array(errors)
         level = np.median(found, axis=0)

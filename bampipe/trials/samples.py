@@ -1,7 +1,5 @@
 """The samples of a session that count, and the statistics of replicates at these samples."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 

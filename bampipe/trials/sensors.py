@@ -3,10 +3,9 @@
 The values that a session file states are checked against the samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -49,7 +48,7 @@ class RecordNoise:
     pulsed: bool = False
 
     @classmethod
-    def of(cls, record: Array, t: Array | None = None) -> RecordNoise:
+    def of(cls, record: Array, t: Array | None = None) -> Self:
         """Measure a record (T,) with time stamps ``t`` (T,); see `white_noise_sd`."""
         sound = np.isfinite(record)
         stamps = None if t is None else t[sound]
@@ -61,7 +60,7 @@ class RecordNoise:
     @classmethod
     def of_inputs(
         cls, records: Mapping[str, Array], readings: Sequence[Array], t: Array
-    ) -> dict[str, RecordNoise]:
+    ) -> dict[str, Self]:
         """Measure inputs by name, each (T,), recorded with ``readings`` of encoders, each (T,).
 
         The part that a controller derives from the readings acts on the machine, so it is not
@@ -198,9 +197,7 @@ class Sensors:
     force_sd: Array
 
     @classmethod
-    def from_result(
-        cls, session: IngestResult, axes: Sequence[str], forces: Sequence[str]
-    ) -> Sensors:
+    def from_result(cls, session: IngestResult, axes: Sequence[str], forces: Sequence[str]) -> Self:
         """The sensors that ``ingest/session.json`` describes, in the order of a model."""
         return cls(
             session.sample_rate_hz,

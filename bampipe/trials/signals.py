@@ -1,9 +1,8 @@
 """Recorded signals of a session, and motions under another meaning of them (sign, unit, zero)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -57,7 +56,7 @@ class Signals:
         return [self.names.index(name) for name in names]
 
     @classmethod
-    def of_session(cls, system: System, session: IngestResult) -> Signals:
+    def of_session(cls, system: System, session: IngestResult) -> Self:
         """The signals of a session that a model uses."""
         device = system.model.device
         axes, forces = system.coordinates, tuple(device.forces)
@@ -126,11 +125,11 @@ class Change:
     gravity: tuple[float, float, float] | None = None
 
     @classmethod
-    def none(cls, count: int) -> Change:
+    def none(cls, count: int) -> Self:
         """The stated reading of ``count`` signals."""
         return cls(np.eye(count), np.zeros(count))
 
-    def after(self, first: Change) -> Change:
+    def after(self, first: "Change") -> "Change":
         """Both changes, ``first`` being applied first."""
         return Change(
             self.gain @ first.gain,

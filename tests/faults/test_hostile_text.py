@@ -15,10 +15,9 @@ from bampipe.report import document
 from bampipe.report.page import render_page
 from bampipe.report.typeset import render_pdf
 from bampipe.results.run import GateVerdict
-from bampipe.run import junit
 from bampipe.run.events import Event
-from bampipe.run.markdown import summary
 from bampipe.run.request import Outcome
+from bampipe.run.summaries import junit, markdown
 
 CLEAR_SCREEN = "\x1b[2J"
 CONTROLS = [CLEAR_SCREEN, "\x9b31m", "\x07", "\x08", "\r", "\u202e", "\x7f", "\udcff", "\ufffe"]
@@ -74,7 +73,7 @@ def test_junit_is_xml_whatever_a_session_is_called(control: str) -> None:
         Outcome(Path(f"s{control}"), "done", verdicts=(verdict,)),
         Outcome(Path("s2"), "refused", error=f"no{control}{MARKUP}"),
     ]
-    top = ElementTree.fromstring(junit.junit(outcomes))
+    top = ElementTree.fromstring(junit(outcomes))
     names = [printable(str(suite.get("name"))) for suite in top]
     assert names == [printable(f"s{control}"), "s2"]
     message = top[0][0][0].get("message")
@@ -84,7 +83,7 @@ def test_junit_is_xml_whatever_a_session_is_called(control: str) -> None:
 def test_markdown_takes_a_session_for_text(tmp_path: Path) -> None:
     hostile = "x|y`*[a](javascript:b)<img src=x>&lt;b&gt;\n# head\x1b[2J"
     outcome = Outcome(tmp_path / "s", "refused", (), (), hostile)
-    (line,) = [line for line in summary([outcome]).splitlines() if "javascript" in line]
+    (line,) = [line for line in markdown([outcome]).splitlines() if "javascript" in line]
     assert "\x1b" not in line and "# head" not in line[:2]
     bare = line.replace("\\\\", "")
     for mark in "|`*[]<>&":

@@ -12,7 +12,7 @@ from bampipe.api import loop
 from bampipe.errors import InputError
 from bampipe.run import record
 from bampipe.run.events import Event
-from bampipe.run.verify import verify
+from bampipe.run.status import verify
 
 
 def run_toys(toy: Toy, limit: int | None = None) -> tuple[int, str]:

@@ -14,7 +14,7 @@ from bampipe.estimate import butterworth
 from bampipe.files import read_json
 from bampipe.progress import silent
 from bampipe.results.setup import AxisSetup, SetupResult
-from bampipe.run.settings import configure
+from bampipe.run.state import configure
 from bampipe.stages import filter as stage
 
 AXES = {

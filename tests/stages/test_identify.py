@@ -15,7 +15,7 @@ from bampipe.errors import InputError
 from bampipe.files import read_json, write_text
 from bampipe.identification.filter_run import MotionLost
 from bampipe.progress import silent
-from bampipe.run.settings import configure
+from bampipe.run.state import configure
 from bampipe.stages import identify
 
 TOLERANCE = {"viscous": 0.03, "coulomb": 0.05, "mass": 0.01}

@@ -21,7 +21,7 @@ from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.files import read_json, toml_text
 from bampipe.progress import silent
-from bampipe.run.settings import configure
+from bampipe.run.state import configure
 from bampipe.stages import ingest
 
 SAMPLES = Path(__file__).parents[2] / "sample_runs"

@@ -15,7 +15,7 @@ from bampipe.errors import InputError
 from bampipe.files import read_json, write_json, write_text
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
-from bampipe.run.settings import configure
+from bampipe.run.state import configure
 from bampipe.simulator import simulated_session as simulation
 from bampipe.stages import identify, validate
 from bampipe.trials.measured import read_measured_trials

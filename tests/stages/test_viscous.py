@@ -17,7 +17,7 @@ from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.viscous_field import viscous_field
 from bampipe.progress import silent
-from bampipe.run.settings import configure
+from bampipe.run.state import configure
 from bampipe.simulator import simulated_session as simulation
 from bampipe.stages import identify, performance, viscous
 

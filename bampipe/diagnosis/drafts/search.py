@@ -4,8 +4,6 @@ A form is a candidate of a `Search` like an effect of the library, with the same
 all forms on grids, the best are refined, and the best of these fitted with the whole model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -7,8 +7,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.drafts.forms import Form, round_constant
-from bampipe.results.intervals import NORMAL_95
-from bampipe.results.rounding import round_with_sd
+from bampipe.results.rounding import NORMAL_95, round_with_sd
 
 _PLACE_IN_WIDTHS = 2.0
 _PLACE_IN_SPANS = 0.1

@@ -1,6 +1,6 @@
 """Content of the page for exploring a run: stored records as plain tables, columns packed."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,18 +10,24 @@ import pandas as pd
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 from bampipe.lists import join_names
-from bampipe.phrases import diagnosis as phrases
 from bampipe.report.document import strip_marks
 from bampipe.report.explorer.packing import Packer
-from bampipe.report.run_results import R, Results
-from bampipe.report.wording import format_prose, format_unit, name_trial_state, split_name
+from bampipe.report.run_results import Results
+from bampipe.report.wording import format_unit, name_trial_state, split_name
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
+from bampipe.results.record import Result
 from bampipe.results.validate import ValidateResult
 
 _BREAK_S = 0.5
 """Gap between two trials on the axis of time, seconds."""
+_SHOWN: Mapping[type[Result], set[str]] = {
+    IdentifyResult: {"parameters", "covariance", "blocks"},
+    ValidateResult: {"axes"},
+    DiagnoseResult: {"axes", "maps", "worst_windows", "ranking", "sets", "descriptions"},
+}
+"""Records of a model that the page holds, and the fields of each; assets/records.js reads them."""
 
 Cell = str | float | int | None
 Content = dict[str, Any]
@@ -84,25 +90,20 @@ def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
         {"name": a, "noun": results.name_force(a), "unit": format_unit(results.force_unit(a))}
         for a in results.axes
     ]
-    tables = [_make_trials(one) for one in shown]
-    for number, diagnosis in reversed(_read_all(versions, DiagnoseResult)):
-        tables.append(_make_candidates(diagnosis, versions[number].label))
+    models = [_describe_model(version) for version in versions]
+    names = {name for one in models if one["identify"] for name in one["identify"]["parameters"]}
+    tables = map(_make_trials, shown)
     path = results.root / "ingest/device.toml"
     robot = read_toml(path).get("robot", {}) if path.is_file() else {}
     joints = robot.get("joints", {})
     return {
-        "models": [_describe_model(version) for version in versions],
+        "models": models,
         "shown": results.models.index(results.model) if results.models else 0,
         "axes": axes,
         "trials": spans,
         "grids": grids.described,
         "channels": grids.channels,
-        "maps": _list_maps(versions),
-        "windows": _list_windows(versions),
-        "ladder": _list_errors(results, versions),
-        "parameters": _list_parameters(results, versions),
-        "correlations": _list_correlations(versions),
-        "verdicts": _list_verdicts(versions),
+        "parameters": results.order_parameters(names),
         "joints": [{"name": name, **joint} for name, joint in joints.items()],
         "tables": [table for table in tables if table["rows"]],
     }
@@ -246,124 +247,23 @@ def _add_recorded(sessions: Sequence[_Session], grids: _Grids) -> None:
 
 
 def _describe_model(version: _Version) -> Content:
+    """Return what the page shows of a model: of its records, the fields that the scripts read."""
     results, name = version.session.results, version.model
-    compared, validated = results.read(CompareResult), results.read(ValidateResult, name)
+    compared = results.read(CompareResult)
     added = [rung.added for rung in (compared.ladder if compared else ()) if rung.model == name]
-    axes = validated.axes if validated else {}
-    return {
+    described: Content = {
         "name": version.session.prefix + name,
         "label": version.label,
+        "prefix": version.session.prefix,
         "added": (added and added[0]) or "",
-        "effects": list(results.effects(name)),
-        "floors": {axis: entry.noise_floor for axis, entry in axes.items()},
     }
-
-
-def _read_each(versions: Sequence[_Version], kind: type[R]) -> list[R | None]:
-    """Return a result of each model, None where it has none."""
-    return [one.session.results.read(kind, one.model) for one in versions]
-
-
-def _read_all(versions: Sequence[_Version], kind: type[R]) -> list[tuple[int, R]]:
-    """Return a result of every model that has it, each with the number of the model."""
-    return [(k, one) for k, one in enumerate(_read_each(versions, kind)) if one is not None]
-
-
-def _list_maps(versions: Sequence[_Version]) -> list[Content]:
-    found = []
-    for number, diagnosis in _read_all(versions, DiagnoseResult):
-        for axis, maps in diagnosis.maps.items():
-            for variable, one in maps.items():
-                band = one.model_dump(mode="json", include={"center", "mean", "low", "high"})
-                about = {"model": number, "axis": axis, "variable": variable, **band}
-                unit = format_unit(one.unit)
-                found.append({**about, "unit": unit, "share": one.variance_share})
-    return found
-
-
-def _list_windows(versions: Sequence[_Version]) -> list[Content]:
-    """Return the worst windows, those of the latest diagnosis first."""
-    return [
-        {
-            **window.model_dump(),
-            "model": number,
-            "trial_id": versions[number].session.prefix + window.trial_id,
-            "unit": format_unit(window.unit),
-            "doing": format_prose(window.doing),
-        }
-        for number, diagnosis in reversed(_read_all(versions, DiagnoseResult))
-        for window in diagnosis.worst_windows
-    ]
-
-
-def _list_verdicts(versions: Sequence[_Version]) -> list[Content]:
-    """Return, by model and axis, the probability of each effect and what it rests on."""
-    found = []
-    for number, diagnosis in reversed(_read_all(versions, DiagnoseResult)):
-        for axis, verdict in versions[number].session.results.order_axes(diagnosis.axes).items():
-            names = {name: share for name, share in verdict.probabilities.items() if share > 0.0}
-            effects = [
-                _describe_effect(diagnosis, axis, name, share)
-                for name, share in sorted(names.items(), key=lambda pair: -pair[1])
-            ]
-            about = {"model": number, "axis": axis, "sentence": strip_marks(verdict.sentence)}
-            found.append({**about, "unknown": verdict.unknown, "effects": effects})
-    return found
-
-
-def _describe_effect(diagnosis: DiagnoseResult, axis: str, name: str, share: float) -> Content:
-    ranked = (
-        {**one.model_dump(mode="json"), "unit": format_unit(one.unit)}
-        for one in diagnosis.ranking
-        if (one.effect, one.axis) == (name, axis)
-    )
-    said = diagnosis.descriptions.get(name.partition(":")[0])
-    sets = [
-        {"effects": phrases.name_set(one), "probability": one.probability}
-        for one in diagnosis.sets
-        if name in one.effects
-    ]
-    about = {"ranked": next(ranked, None), "said": said and said.model_dump(mode="json")}
-    return {"name": name, "probability": share, **about, "sets": sets}
-
-
-def _list_errors(results: Results, versions: Sequence[_Version]) -> Content:
-    """Return, by axis, held-out error and noise floor of each version, in their order."""
-    ladder: Content = {}
-    for axis in results.axes:
-        found = [one and one.axes.get(axis) for one in _read_each(versions, ValidateResult)]
-        shown = [{"error": e and e.held_out_rmse, "floor": e and e.noise_floor} for e in found]
-        ladder |= {axis: shown} if any(found) else {}
-    return ladder
-
-
-def _list_parameters(results: Results, versions: Sequence[_Version]) -> list[Content]:
-    identified = _read_each(versions, IdentifyResult)
-    names = {name: p.unit for one in identified if one for name, p in one.parameters.items()}
-    found = []
-    for name in results.order_parameters(names):
-        values = [one.parameters.get(name) if one else None for one in identified]
-        shown = [
-            v.model_dump(include={"estimate", "sd", "at_bound"}) if v else None for v in values
-        ]
-        found.append({"name": name, "unit": format_unit(names[name]), "values": shown})
-    return found
-
-
-def _list_correlations(versions: Sequence[_Version]) -> list[Content]:
-    found = []
-    for number, identified in _read_all(versions, IdentifyResult):
-        if not identified.covariance.names:
-            continue
-        covariance = np.array(identified.covariance.matrix)
-        sd = np.sqrt(np.diag(covariance))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            matrix = covariance / np.outer(sd, sd)
-        rows = [[float(v) if np.isfinite(v) else None for v in row] for row in matrix]
-        names = list(identified.covariance.names)
-        blocks = identified.blocks
-        found.append({"model": number, "names": names, "matrix": rows, "blocks": blocks})
-    return found
+    for kind, fields in _SHOWN.items():
+        found = results.read(kind, name)
+        described[kind.STAGE] = found and found.model_dump(mode="json", include=fields)
+    diagnosis = described["diagnose"]
+    for verdict in diagnosis["axes"].values() if diagnosis else ():
+        verdict["sentence"] = strip_marks(verdict["sentence"])
+    return described
 
 
 def _make_trials(session: _Session) -> Content:
@@ -389,21 +289,3 @@ def _make_trials(session: _Session) -> Content:
     head = ["Trial", "Kind", "State", "Duration (s)", *heads]
     title = f"Trials {session.prefix}".strip()
     return {"title": title, "note": note, "head": head, "rows": rows}
-
-
-def _make_candidates(diagnosis: DiagnoseResult, label: str) -> Content:
-    rows = [
-        [
-            *(entry.effect, entry.axis, entry.held_out_rmse_before, entry.held_out_rmse_after),
-            *(format_unit(entry.unit), entry.probability, entry.p_value),
-            ", ".join(entry.indistinguishable_from),
-        ]
-        for entry in diagnosis.ranking
-    ]
-    head = ["Effect", "Axis", "Without", "With", "Unit", "Probability", "p"]
-    head.append("Indistinguishable from")
-    note = (
-        "Held-out error without and with each effect; the one that was not fitted is scaled by the "
-        "weighted misfit. p: probability that replicates give any candidate as large a gain."
-    )
-    return {"title": f"Candidate effects, {label}", "note": note, "head": head, "rows": rows}

@@ -14,6 +14,7 @@ from bampipe.report.run_results import Results
 _ASSETS = Path(__file__).parent / "assets"
 SCRIPTS = (
     "data",
+    "records",
     "statistics",
     "figure",
     "traces",

@@ -50,7 +50,7 @@ def _show_model(
         shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
         if len(shown) > 1:
             first = shown[0].log_evidence
-            sets = ((phrases.name_set(one, "`"), one) for one in shown[:_MOST_RANKED])
+            sets = ((phrases.name_set(one), one) for one in shown[:_MOST_RANKED])
             yield Table(
                 "Sets of effects, the most probable first",
                 "Effects | >Probability | >Log evidence over the first (nats)",

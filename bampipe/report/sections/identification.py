@@ -23,7 +23,7 @@ from bampipe.report.wording import (
     name_parameter,
 )
 from bampipe.results.identify import IdentifyResult, ParameterEstimate
-from bampipe.results.intervals import NORMAL_95
+from bampipe.results.rounding import NORMAL_95
 from bampipe.results.validate import ValidateResult
 
 TITLE = "Identification"

@@ -19,7 +19,7 @@ from bampipe.report.wording import (
 )
 from bampipe.results.compare import CompareResult
 from bampipe.results.identify import IdentifyResult, ParameterEstimate
-from bampipe.results.intervals import NORMAL_95
+from bampipe.results.rounding import NORMAL_95
 from bampipe.results.setup import SetupResult
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import JudgedError, ValidateResult

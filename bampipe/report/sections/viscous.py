@@ -9,7 +9,7 @@ from bampipe.lists import join_names
 from bampipe.report import style
 from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
-from bampipe.results.intervals import NORMAL_95
+from bampipe.results.rounding import NORMAL_95
 from bampipe.results.viscous import Damping, ViscousResult
 
 TITLE = "Viscous field"

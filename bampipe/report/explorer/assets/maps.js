@@ -21,7 +21,7 @@ function samplesOf(axis) {
 function variablesOf(axis) {
   const shares = new Map();
   for (const one of content.maps.filter((map) => map.axis === axis)) {
-    shares.set(one.variable, { share: Math.max(one.share, shares.get(one.variable)?.share ?? 0), unit: one.unit });
+    shares.set(one.variable, { share: Math.max(one.variance_share, shares.get(one.variable)?.share ?? 0), unit: one.unit });
   }
   return [...shares].map(([variable, rest]) => ({ variable, ...rest })).sort((a, b) => b.share - a.share);
 }

@@ -67,4 +67,14 @@ function buildTables() {
     );
   }
   for (const table of content.tables) host.append(tableOf(table));
+  for (const { model, ranking } of newestFirst.filter((one) => one.ranking.length)) {
+    host.append(
+      tableOf({
+        title: `Candidate effects, ${labelOf(model)}`,
+        note: "Held-out error without and with each effect; the one that was not fitted is scaled by the weighted misfit. p: probability that replicates give any candidate as large a gain.",
+        head: ["Effect", "Axis", "Without", "With", "Unit", "Probability", "p", "Indistinguishable from"],
+        rows: ranking.map((one) => [one.effect, one.axis, one.held_out_rmse_before, one.held_out_rmse_after, unitOf(one.unit), one.probability, one.p_value, one.indistinguishable_from.join(", ")]),
+      }),
+    );
+  }
 }

@@ -85,7 +85,7 @@ class Trace {
       ? [{ kind: "spans", values: [state.window.span], colour: "purple", alpha: 0.16 }]
       : [];
     if (!this.described.residual) return [...marked, ...window, ...starts];
-    const floor = content.models[newestShown()]?.floors[this.described.axis];
+    const floor = content.models[newestShown()]?.validate?.axes[this.described.axis]?.noise_floor;
     const levels = floor ? [{ kind: "band", x: session, low: [-2 * floor, -2 * floor], high: [2 * floor, 2 * floor], colour: "green", alpha: 0.14, label: "± 2 noise floors" }] : [];
     return [...levels, ...marked, ...window, { kind: "rule", y: 0, colour: "faint" }, ...starts];
   }

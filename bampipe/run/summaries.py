@@ -1,18 +1,55 @@
-"""The outcome of a run in Markdown, for a pull request or the summary of a CI job."""
+"""The outcome of a run for a CI job: the gates as JUnit XML, and a summary in Markdown."""
 
-from collections.abc import Sequence
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Sequence
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, printable
 from bampipe.results.validate import ValidateResult
 from bampipe.run.request import Outcome
 
+_TAGS = {"failed": "failure", "absent": "skipped"}
 STATES = {0: "passed", 1: "**gate failed**", 2: "**bad input**", 3: "**crashed**"}
 MOST = 30
 """Largest number of rows in a table, so that a summary is short enough to be read."""
 
 
-def summary(outcomes: Sequence[Outcome]) -> str:
+def junit(outcomes: Iterable[Outcome]) -> bytes:
+    """Return the verdicts as JUnit XML: a session is a test suite, a gate on an axis a test."""
+    top = ElementTree.Element("testsuites", name="bampipe")
+    for outcome in outcomes:
+        states = [verdict.state for verdict in outcome.verdicts]
+        suite = ElementTree.SubElement(
+            top,
+            "testsuite",
+            name=outcome.root.name,
+            tests=str(len(states) + bool(outcome.error)),
+            failures=str(states.count("failed")),
+            errors=str(int(bool(outcome.error))),
+            skipped=str(states.count("absent")),
+        )
+        models = sorted({verdict.model for verdict in outcome.verdicts if verdict.model})
+        if models:
+            properties = ElementTree.SubElement(suite, "properties")
+            for model in models:
+                ElementTree.SubElement(properties, "property", name="model", value=model)
+        of_suite = {"classname": outcome.root.name}
+        if outcome.error:
+            case = ElementTree.SubElement(suite, "testcase", of_suite, name="the pipeline finishes")
+            ElementTree.SubElement(case, "error", message=outcome.error)
+        for verdict in outcome.verdicts:
+            name = f"{verdict.gate}: {verdict.key}" if verdict.key else verdict.gate
+            case = ElementTree.SubElement(suite, "testcase", of_suite, name=name)
+            if tag := _TAGS.get(verdict.state):
+                ElementTree.SubElement(case, tag, message=verdict.message)
+            elif verdict.state == "warned":
+                ElementTree.SubElement(case, "system-out").text = verdict.message
+    ElementTree.indent(top)
+    text = ElementTree.tostring(top, encoding="unicode")
+    return f"<?xml version='1.0' encoding='utf-8'?>\n{printable(text)}\n".encode()
+
+
+def markdown(outcomes: Sequence[Outcome]) -> str:
     """Return the summary of a run as GitHub-flavoured Markdown."""
     codes = [outcome.exit_code for outcome in outcomes]
     lines = [f"## bampipe: {_headline(codes)}", ""]
