@@ -97,9 +97,9 @@ def split_alternatives(
         shown = " with ".join(rest) or ("nothing more" if common else "nothing")
         parts.append(f"{shown} ({probability(chance)})")
     if not parts:
-        doubtful = (n for names, _ in sets for n in names if n not in (*common, UNKNOWN))
-        parts = [list_effects(entry, [name], mark) for name in doubtful]
-    parts = parts or [f"{UNKNOWN} ({probability(entry.unknown)})"]
+        # In doubt together, since something unknown may resemble them: no alternatives.
+        doubtful = [n for names, _ in sets for n in names if n not in (*common, UNKNOWN)]
+        parts = [list_effects(entry, doubtful, mark) or f"{UNKNOWN} ({probability(entry.unknown)})"]
     parts[0] = parts[0].replace(" (", f" ({first}", 1)
     known = list_effects(entry, common, mark).replace(" (", f" ({first}", 1)
     return known, parts
