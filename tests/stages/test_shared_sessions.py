@@ -23,7 +23,7 @@ method = "{}"
     ("name", "method", "missing", "last"),
     [
         ("open-01", "auto", None, "identify"),
-        ("open-02", "least-squares", "yaw", "validate"),
+        pytest.param("open-02", "least-squares", "yaw", "validate", marks=pytest.mark.long),
         pytest.param("open-09", "auto", None, "validate", marks=pytest.mark.long),
     ],
 )
