@@ -169,7 +169,7 @@ def test_the_force_noise_moves_the_encoder_of_an_axis_that_winds_up(tmp_path: Pa
     """Without that in the noise of the readings, the filter gave the friction as 14 for 4.2."""
     name = "transmission_compliance.yaw.compliance"
     wound = {"effect": "transmission_compliance:yaw", "hidden": {name: 2e-3}}
-    run = simulated_run(tmp_path, seconds=6.0, **wound)
+    run = simulated_run(tmp_path, seconds=4.0, **wound)
     text = MODEL.replace("[]", '["transmission_compliance:yaw"]')
     write_text(run.path("models/base/model.toml"), text)
     content = identified(run, replace(FAST, method="ukf"))

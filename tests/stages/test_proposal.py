@@ -354,8 +354,9 @@ def test_each_recording_of_a_file_is_a_trial(tmp_path, command: Command, header:
     assert [trial.get("recording") for trial in session["trials"]] == [1, 2, None]
     begins = 1002 + len(header)
     assert f"a.csv holds 2 recordings, which begin again at row {begins}" in proposal.check
+    trials = samples(tmp_path, tmp_path / "out", None).groupby("trial_id")
     for trial, rate in (("a", 1.0), ("a_2", 1.5), ("b", 1.0)):
-        found = samples(tmp_path, tmp_path / "out", trial)
+        found = trials.get_group(trial)
         np.testing.assert_allclose(found["t"], t[: len(found)], atol=1e-9)
         np.testing.assert_allclose(found["q_joint"], np.sin(rate * t[: len(found)]), atol=1e-6)
     text = re.sub("recording = .*", "", (tmp_path / "session.toml").read_text())
@@ -393,7 +394,7 @@ def test_of_two_joints_without_a_drawing_a_position_has_its_own_drive(tmp_path):
 
 def test_the_files_of_one_recording_are_joined(tmp_path):
     """One quantity a file, as matrices without names; rows that one file has more are left out."""
-    log = joint_log(3)
+    log = joint_log(3, seconds=10.0)
     for k in (1, 2):
         rows = np.column_stack([np.deg2rad(log["joint_angle"]), log["joint_velocity"]])
         np.savetxt(tmp_path / f"excit_ang_{k}.txt", rows[k:], "%.8f")

@@ -91,7 +91,7 @@ def test_what_brakes_do_is_judged_in_the_trials_in_which_they_act(tmp_path: Path
         text = MODEL.replace("[]", effects).replace('"base"', f'"{name}"', 1)
         write_text(run.path(f"models/{name}/model.toml"), text)
         identify.execute(run, run.root, replace(SQUARES, model=name), silent)
-        content = validated(run, validate.Config(model=name))
+        content = validated(run, validate.Config(model=name, repeats=3))
         ratios[name] = {
             axis: entry["held_out_rmse"] / entry["noise_floor"]
             for axis, entry in content["axes"].items()
