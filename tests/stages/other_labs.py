@@ -70,11 +70,6 @@ def damper_log(seed: int, seconds: float = 12.0) -> dict[str, np.ndarray]:
     }
 
 
-DAMPER_UNITS = {
-    "Time": "s", "Displacement": "mm", "Velocity": "mm/s", "Force": "N", "Current": "A",
-}  # fmt: skip
-
-
 def write_table(path: Path, table: dict[str, np.ndarray], form: str = "%.7g") -> None:
     """Columns of numbers with a header, between commas or as Parquet."""
     if path.suffix == ".parquet":
@@ -92,15 +87,3 @@ def write_joint_logs(folder: Path, count: int = 3) -> None:
         names = " ".join(columns)
         table = np.column_stack(list(columns.values()))
         np.savetxt(folder / f"run_{seed}.txt", table, fmt="%.6f", header=names)
-
-
-def write_damper_logs(folder: Path, count: int = 3) -> None:
-    """Semicolons, decimal commas, remarks above and a line of units, as of a German test stand."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(count):
-        columns = damper_log(seed)
-        lines = ["Pruefstand 2", "Probe;MR-3", "", ";".join(columns)]
-        lines.append(";".join(DAMPER_UNITS[name] for name in columns))
-        for row in zip(*columns.values(), strict=True):
-            lines.append(";".join(f"{cell:.5f}".replace(".", ",") for cell in row))
-        (folder / f"versuch{seed}.csv").write_text("\r\n".join(lines) + "\r\n")
