@@ -5,8 +5,10 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from bampipe.declarations.model import ModelFile
 from bampipe.files import write_json
 from bampipe.results.record import Record, Result
+from bampipe.run import models
 
 _ABSENT: Any = object()
 _MADE_UP = {str: "?", float: 1.0, int: 1, bool: False, tuple: [], dict: {}}
@@ -65,3 +67,8 @@ def write_result(root: Path, kind: type[Result], **given: Any) -> dict[str, Any]
     content: dict[str, Any] = filled(kind, given)
     write_json(root / kind.file(str(given.get("model", "base"))), content)
     return content
+
+
+def write_model(root: Path, name: str, *effects: str, **more: str) -> None:
+    """Write a model version with these effects, of the BAM unless ``more`` names a device."""
+    models.write(root, ModelFile(**{"name": name, "device": "bam", "effects": effects, **more}))

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 from conftest import Command
-from made_results import write_result
+from made_results import write_model, write_result
 
 from bampipe.api.opened import Run
-from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.lab.rows import read_run
@@ -138,7 +137,7 @@ def test_every_command_takes_the_best_confirmed_model(
     root = made(tmp_path / "runs/s1", mass=2.0)
     better = "base+stribeck.yaw"
     for name, error in (("base", 0.56), (better, 0.1)):
-        models.write(root, ModelFile(name=name, device="bam"))
+        write_model(root, name)
         entries = {"mass": {"estimate": 2.0 if name == "base" else 3.0, "sd": 0.1, "unit": "kg"}}
         write_result(root, IdentifyResult, model=name, parameters=entries)
         axis = {"held_out_rmse": error, "noise_floor": 0.1}

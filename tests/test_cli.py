@@ -10,7 +10,7 @@ from pathlib import Path
 import install_toys
 import pytest
 from conftest import Command, Toy, bytes_of
-from made_results import filled, write_result
+from made_results import filled, write_model, write_result
 
 import bampipe
 from bampipe.cli import one_stage, places, show
@@ -301,18 +301,6 @@ def test_one_effect_in_full(command: Command) -> None:
         assert text in out
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("stribek", "did you mean 'stribeck'"),
-        ("stribeck:yow", "did you mean 'yaw'"),
-        ("absent.toml", "no such file"),
-    ],
-)
-def test_wrong_effect(command: Command, name: str, message: str) -> None:
-    assert message in one_line_error(*command("effects", name))
-
-
 # Printing
 
 
@@ -395,14 +383,8 @@ def test_a_refused_extension_leaves_nothing(
 
 
 def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
-    folder = ingested / "models" / "base+stribeck.yaw"
-    folder.mkdir(parents=True)
-    (folder.parent / "base").mkdir()
-    (folder.parent / "base" / "model.toml").write_text(
-        'schema = "bampipe.model/1"\nname = "base"\ndevice = "bam"\neffects = []\n'
-    )
-    text = 'schema = "bampipe.model/1"\nname = "base+stribeck.yaw"\nparent = "base"\n'
-    (folder / "model.toml").write_text(text + 'device = "bam"\neffects = ["stribeck:yaw"]\n')
+    write_model(ingested, "base")
+    write_model(ingested, "base+stribeck.yaw", "stribeck:yaw")
     extended = ("--model", "base+stribeck.yaw")
     error = one_line_error(*command("extend", ingested, "stribeck:yaw", *extended))
     assert "already has stribeck:yaw" in error

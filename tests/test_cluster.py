@@ -59,13 +59,6 @@ def check(toy: Toy, given: list[Request], states: list[str]) -> None:
 
 
 @pytest.mark.slow
-def test_same_bytes_as_the_local_engine(toy: Toy, cluster: Any) -> None:
-    given = toy.many(FOUR)
-    outcomes = run_on_cluster(given, cluster.scheduler_address, ignore_event)
-    check(toy, given, [outcome.state for outcome in outcomes])
-
-
-@pytest.mark.slow
 def test_a_worker_killed_in_mid_run_loses_nothing(toy: Toy, cluster: Any) -> None:
     given = toy.many(FOUR)
     victim = next(iter(cluster.workers.values())).pid

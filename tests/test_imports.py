@@ -4,6 +4,7 @@ import ast
 import resource
 import subprocess
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -91,10 +92,15 @@ LAWS = {
 }
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imported(path: Path, lazily: bool = True) -> set[str]:
     """Full names of the modules that ``path`` imports; ``lazily``: inside functions too."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    found = set()
+    tree, found = tree_of(path), set()
     for node in ast.walk(tree) if lazily else _at_import(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
@@ -181,7 +187,7 @@ def test_every_layer_is_under_the_law_and_what_is_compiled_kept() -> None:
 def _attributes_of_numba(path: Path) -> set[str]:
     return {
         node.attr
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in ast.walk(tree_of(path))
         if isinstance(node, ast.Attribute)
         and isinstance(node.value, ast.Name)
         and node.value.id == "numba"

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import pytest
-from made_results import diagnosis, filled, write_result
+from made_results import diagnosis, filled, write_model, write_result
 
 from bampipe.api import loop
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model import ModelFile
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.run import RunResult
@@ -24,10 +23,9 @@ def made(settings: dict[str, object]) -> dict[str, object]:
 
 
 def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
-    models.write(tmp_path, ModelFile(name="base", device="slider"))
+    write_model(tmp_path, "base", device="slider")
     child = models.child_name("base", ("stribeck:carriage",))
-    effects = ("stribeck:carriage",)
-    models.write(tmp_path, ModelFile(name=child, parent="base", device="slider", effects=effects))
+    write_model(tmp_path, child, "stribeck:carriage", parent="base", device="slider")
     stages = {
         "identify:base": made({"model": "base", "method": "least-squares"}),
         "validate:base": made({"model": "base", "seed": 3}),

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 from conftest import Toy, contents
-from made_results import write_result
+from made_results import write_model, write_result
 
 from bampipe.cli.one_stage import parse_settings
-from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
@@ -260,8 +259,7 @@ def add_child(toy: Toy) -> str:
     """Write a child of the base model and return its name."""
     name = models.child_name("base", ("stribeck:yaw",))
     device = models.read(toy.root, "base").device
-    file = ModelFile(name=name, parent="base", device=device, effects=("stribeck:yaw",))
-    models.write(toy.root, file)
+    write_model(toy.root, name, "stribeck:yaw", parent="base", device=device)
     return name
 
 

@@ -182,22 +182,6 @@ def test_signals_in_rows_of_their_own_are_put_beside_one_another(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    "form",
-    [
-        "13.10.2026 14:00:0{:.3f}", "10/13/2026 2:00:0{:.3f} PM", "13-Oct-2026 14:00:0{:.3f}",
-        "2:00:0{:.3f} pm", "00:0{:.3f}", "0 days 00:00:0{:.3f}",
-    ],
-)  # fmt: skip
-def test_dates_as_people_write_them(tmp_path: Path, form: str):
-    path = tmp_path / "a.csv"
-    rows = [f"{form.format(t)},{q}\n" for t, q in zip(T, Q, strict=True)]
-    path.write_text("".join(["when,q\n", *rows]))
-    assert columns_of(path) == {"when": "datetime", "q": ""}
-    trial = read_trial(path, ("when", "q"), datetimes={"when": ""})
-    np.testing.assert_allclose(trial.columns["when"], T, atol=1e-9)
-
-
-@pytest.mark.parametrize(
     ("name", "said"),
     [
         ("Sollposition [°]", ["soll", "position"]), ("Motorstrom", ["motor", "strom"]),

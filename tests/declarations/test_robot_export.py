@@ -225,24 +225,6 @@ def test_a_urdf_is_given_back_with_its_names_frames_and_shapes(cell: Identified)
     assert ElementTree.tostring(before) == ElementTree.tostring(after)
 
 
-def test_frames_are_where_they_were_drawn(cell: Identified) -> None:
-    q = np.array([0.4, 0.7, np.cos(1.1), np.sin(1.1)])
-    placed = []
-    for text in (URDF, export_model(cell.run, "base", "urdf")):
-        model = pin.buildModelFromXML(text)
-        full = pin.neutral(model)
-        names = [str(n) for n in model.names]
-        for name, values in (("pan-1", q[:1]), ("slide", q[1:2]), ("bend", q[2:])):
-            first = model.joints[names.index(name)].idx_q
-            full[first : first + len(values)] = values
-        data = model.createData()
-        pin.framesForwardKinematics(model, data, full)
-        placed.append({str(f.name): data.oMf[k] for k, f in enumerate(model.frames)})
-    assert set(placed[0]) == set(placed[1]) and "tool0" in placed[1]
-    for name, place in placed[0].items():
-        np.testing.assert_allclose(placed[1][name].homogeneous, place.homogeneous, atol=1e-12)
-
-
 def test_mass_is_with_the_link_that_carries_it_or_beyond_a_joint_as_drawn(cell: Identified) -> None:
     text = export_model(cell.run, "base", "urdf")
     masses = {

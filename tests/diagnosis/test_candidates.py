@@ -21,16 +21,6 @@ DAMPER = registry.device("magnetic_damper")
 LAG, SATURATION = "channel_lag:current", "channel_saturation:current"
 
 
-@pytest.mark.parametrize("effect", ["gear_loss", "cable_torque"])
-def test_gears_and_cables_are_weighed_wherever_a_motor_drives(effect):
-    def weighed(device: str) -> bool:
-        names = list_candidates(registry.device(device), ())
-        return any(name.startswith(f"{effect}:") for name in names)
-
-    assert weighed("slider") and weighed("servo_pendulum")
-    assert not weighed("bam") and not weighed("magnetic_damper")
-
-
 @pytest.mark.parametrize(
     ("effect", "axes"),
     [
@@ -90,7 +80,6 @@ def test_only_effects_that_meet_are_taken_together():
 
 
 NAMED = [
-    ("joint", 41, "shear_thinning:joint", ("stribeck:joint", "quadratic_drag:joint")),
     ("joint", 43, "maxwell_slip:joint", ("presliding:joint", "stribeck:joint")),
     ("joint", 45, "presliding:joint", ("maxwell_slip:joint", "stribeck:joint")),
     ("wrist", 56, "unbalance:a", ("force_bias:a", "torque_ripple:a", "return_spring:a")),
@@ -99,6 +88,10 @@ NAMED = [
     ("joint", 41, "loose_drive:joint", ("loose_load:joint", "presliding:joint")),
     pytest.param(
         "axis", 58, "maxwell_slip:carriage", ("presliding:carriage", "stribeck:carriage"),
+        marks=pytest.mark.long,
+    ),
+    pytest.param(
+        "joint", 41, "shear_thinning:joint", ("stribeck:joint", "quadratic_drag:joint"),
         marks=pytest.mark.long,
     ),
 ]  # fmt: skip

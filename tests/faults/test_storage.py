@@ -3,16 +3,24 @@
 import json
 import os
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import Toy
 
 from bampipe.api import loop
 from bampipe.errors import InputError
+from bampipe.report import typeset
+from bampipe.report.document import Document
 from bampipe.run import record
 from bampipe.run.events import Event
 from bampipe.run.status import verify
+from bampipe.trials.kept import KeptItems
+from bampipe.trials.motion import Motion
 
 
 def run_toys(toy: Toy, limit: int | None = None) -> tuple[int, str]:
@@ -28,21 +36,28 @@ def assert_refused(toy: Toy, message: str, limit: int | None = None) -> None:
     assert code == 2 and said.count("\n") == 1 and message in said, said
 
 
-@pytest.fixture
-def disk(toy: Toy) -> Iterator[Callable[[str], None]]:
-    """Put the run folders on a disk of 1 MB; returns how to mount it again otherwise."""
-    toy.runs.mkdir()
+@contextmanager
+def small_disk(folder: Path, size: str) -> Iterator[Callable[[str], None]]:
+    """Put a folder on a disk of its own; gives how to mount it again otherwise."""
+    folder.mkdir()
 
     def mount(*arguments: str) -> bool:
-        command = ["mount", *arguments, str(toy.runs)]
+        command = ["mount", *arguments, str(folder)]
         return subprocess.run(command, capture_output=True).returncode == 0
 
-    if os.geteuid() != 0 or not mount("-t", "tmpfs", "-o", "size=1m", "tmpfs"):
+    if os.geteuid() != 0 or not mount("-t", "tmpfs", "-o", f"size={size}", "tmpfs"):
         pytest.skip("a small disk can be mounted by root only, and not everywhere")
     try:
         yield lambda options: pytest.fail("remount") if not mount("-o", options) else None
     finally:
-        subprocess.run(["umount", "-l", str(toy.runs)], check=True)
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.fixture
+def disk(toy: Toy) -> Iterator[Callable[[str], None]]:
+    """The run folders are on a disk of 1 MB, which can be mounted again otherwise."""
+    with small_disk(toy.runs, "1m") as remount:
+        yield remount
 
 
 LONG = [pytest.param(room, marks=pytest.mark.long) for room in (4096, 8192, 16384, 24576)]
@@ -132,3 +147,44 @@ def test_extending_respects_the_lock(toy: Toy) -> None:
     ):
         loop.extend(options, "base", ("stribeck:yaw",))
     assert toy.files() == before
+
+
+# Temporary files
+
+
+@pytest.fixture
+def full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder for temporary files in which nothing has room."""
+    folder = tmp_path / "temporary"
+    with small_disk(folder, "16k"):
+        (folder / "filler").write_bytes(b"x" * 12288)
+        monkeypatch.setattr(tempfile, "tempdir", str(folder))
+        yield folder
+
+
+def motion(size: int = 20000) -> Motion:
+    t = np.arange(size) / 500.0
+    q = np.random.default_rng(0).normal(size=(size, 1))
+    return Motion("t01", t, q, q, q, q, {})
+
+
+def test_stored_trials(full: Path) -> None:
+    with pytest.raises(InputError, match="written: the disk is full") as caught:
+        KeptItems([motion()], most=1)
+    assert caught.value.where == str(full) and "TMPDIR" in caught.value.remedy
+    assert [path.name for path in full.iterdir()] == ["filler"]
+
+
+def test_the_report(full: Path) -> None:
+    (full / "more").write_bytes(b"x" * 4096)
+    with pytest.raises(InputError, match="no temporary files can be written"):
+        typeset.render_pdf(Document("title", "subtitle", ()), 0)
+
+
+def test_no_folder_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere() -> str:
+        raise FileNotFoundError(2, "No usable temporary directory found in ['/tmp']")
+
+    monkeypatch.setattr(tempfile, "gettempdir", nowhere)
+    with pytest.raises(InputError, match="no folder for temporary files"):
+        KeptItems([motion(10)], most=1)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from independent_runs import record_trials
+from made_results import write_model
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.files import write_text
 from bampipe.identification.choice import find_objections
 from bampipe.identification.estimates import Estimate
 from bampipe.identification.identifiability import _describe_leaning, _describe_number
@@ -77,9 +77,7 @@ def test_a_drive_that_friction_stops_at_once_is_not_simulated(tmp_path) -> None:
     """Its friction is a hundred times its inertia: steps of a simulation would be of 0.1 us."""
     _, _, truth = record_trials(tmp_path, "drive", 99201)
     run = RunFolder(tmp_path / "run")
-    device = run.read(IngestResult).device
-    text = f'schema = "bampipe.model/1"\nname = "base"\ndevice = "{device}"\neffects = []\n'
-    write_text(run.path("models/base/model.toml"), text)
+    write_model(run.root, "base", device=run.read(IngestResult).device)
     identify.execute(run, run.root, identify.Config(), silent)
     found = run.read(IdentifyResult, "base")
     assert found.method == "least-squares"

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from independent_runs import record_trials
+from made_results import write_model
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.files import write_text
 from bampipe.identification.filter_estimate import _Widths
 from bampipe.identification.sensor_noise import choose_tuning_trials
 from bampipe.physics.model_spec import ModelSpec
@@ -15,11 +15,6 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.stages import identify
 
 EFFECT = "stribeck:yaw"
-MODEL = """schema = "bampipe.model/1"
-name = "right"
-device = "bam"
-effects = ["stribeck:yaw"]
-"""
 
 
 def test_widths_change_and_nothing_else() -> None:
@@ -56,7 +51,7 @@ def identified(root, **conditions) -> tuple[IdentifyResult, dict[str, float]]:
         root, "bam", 8602, EFFECT, trials=2, seconds=5.0, rate_hz=400.0, **conditions
     )
     run = RunFolder(root / "run")
-    write_text(run.path("models/right/model.toml"), MODEL)
+    write_model(run.root, "right", EFFECT)
     identify.execute(run, run.root, identify.Config(model="right", method="ukf"), silent)
     return run.read(IdentifyResult, "right"), truth
 

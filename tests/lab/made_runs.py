@@ -4,10 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from made_results import diagnosis, write_result
+from made_results import diagnosis, write_model, write_result
 
 from bampipe.data import store
-from bampipe.declarations.model import ModelFile
 from bampipe.files import write_json
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.floor import compare_with_floor
@@ -15,7 +14,6 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
-from bampipe.run import models
 
 AXES = ("yaw", "pitch")
 
@@ -79,7 +77,7 @@ class Made:
         parameters: Mapping[str, float],
         error: Mapping[str, float],
     ) -> None:
-        models.write(root, ModelFile(name=name, device="bam", effects=effects))
+        write_model(root, name, *effects)
         known = {"sd": self.sd, "unit": "N.m", "at_bound": False}
         entries = {key: {"estimate": value, **known} for key, value in parameters.items()}
         nis = {"by_trial": {"t1": 1.1}}

@@ -19,6 +19,7 @@ from bampipe.files import digest_file
 from bampipe.lab.collect import collect
 from bampipe.lab.folders import is_current
 from bampipe.phrases import lab as phrases
+from bampipe.report import style, typeset
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.run import RunResult
@@ -51,6 +52,13 @@ def make_lab(folder: Path, *changed: Made, sessions: int = 9) -> Path:
         shutil.rmtree(folder / "runs" / one.name, ignore_errors=True)
         one.write(folder / "runs")
     return folder / "runs"
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without figures and print, which take most of their time."""
+    monkeypatch.setattr(typeset, "render_pdf", lambda *_: b"")
+    monkeypatch.setattr(style, "render_svg", lambda _: "<svg></svg>")
 
 
 DRIFTED = made(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
@@ -262,6 +270,7 @@ def test_the_report_says_what_the_trends_say(tmp_path: Path) -> None:
     assert (tmp_path / "lab/figures/charts-1.svg").is_file()
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(("sessions", "limits"), [(9, True), (3, False)])
 def test_words_about_limits_are_true_of_the_charts(
     tmp_path: Path, sessions: int, limits: bool, capsys: pytest.CaptureFixture[str]
@@ -277,6 +286,7 @@ def test_words_about_limits_are_true_of_the_charts(
     assert ("no control limits yet" in capsys.readouterr().out) is not limits
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_after_several_sessions_the_page_that_links_them_comes_next(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -286,6 +296,7 @@ def test_after_several_sessions_the_page_that_links_them_comes_next(
     assert said == f"next: open {tmp_path / 'lab/report.html'}, which links every session"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_links_the_pages_of_every_session(tmp_path: Path) -> None:
     runs = make_lab(tmp_path, sessions=5)
     for name in ("report.html", "explore.html"):
@@ -299,6 +310,7 @@ def test_the_page_links_the_pages_of_every_session(tmp_path: Path) -> None:
     assert all((tmp_path / "out/lab" / target).is_file() for target in targets)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_command(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     make_lab(tmp_path, DRIFTED)
     monkeypatch.chdir(tmp_path)

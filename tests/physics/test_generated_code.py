@@ -170,22 +170,6 @@ def test_reading_of_the_encoders_is_its_offset_from_the_motion(name):
         np.testing.assert_allclose(read, [*q[i], *qd[i]], rtol=1e-7, atol=1e-7)
 
 
-def test_internal_states_settle_where_their_rate_vanishes():
-    system = compile_model(Model(BAM, ("gravity_compensator_lag",)))
-    t = np.arange(0.0, 4.0, 0.005)
-    q = np.tile([0.0, 0.1, 0.9], (len(t), 1))
-    q[t > 0.5, 2] = 1.2
-    qd, u = np.zeros_like(q), np.zeros((len(t), len(system.inputs)))
-    p = typical_parameters(system)
-    z = system.memory(q, qd, qd, u, p, t)
-    assert z.shape == (len(t), 1)
-    np.testing.assert_allclose(z[t <= 0.5, 0], 0.9 - 0.461, atol=1e-12)
-    lag = p[system.index("gravity_compensator_lag.time_constant")]
-    later = t > 0.52
-    expected = 1.2 - 0.461 - 0.3 * np.exp(-(t[later] - 0.505) / lag)
-    np.testing.assert_allclose(z[later, 0], expected, atol=0.005)
-
-
 def test_key_changes_with_the_text_of_effect_and_device_and_only_then():
     text = dict(registry.effect("stribeck").declaration)
     keys = [

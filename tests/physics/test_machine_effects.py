@@ -56,7 +56,7 @@ def test_friction_by_pose_takes_every_two_axes_from_the_middle_of_the_other():
 def test_motor_effects_are_offered_to_motors_only():
     motors = (
         "torque_ripple", "actuator_lag", "actuator_delay", "drive_sag", "flexible_load",
-        "loose_load", "loose_drive",
+        "loose_load", "loose_drive", "gear_loss", "cable_torque",
     )  # fmt: skip
     for name in motors:
         assert registry.effect(name).targets(registry.device("slider"))

@@ -5,12 +5,12 @@ The numbers mean nothing; files and fields are those that the stages leave.
 
 from pathlib import Path
 
+import made_results
 import numpy as np
 import pandas as pd
 from made_results import diagnosis, filled, write_result
 
 from bampipe.data.store import write_parquet
-from bampipe.files import write_text
 from bampipe.phrases import diagnosis as phrases
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
@@ -158,9 +158,7 @@ def parameters(model: str) -> dict[str, tuple[float, float, str]]:
 
 def write_model(root: Path, model: str) -> None:
     """Write what identification leaves."""
-    effects = '["stribeck:yaw"]' if model == CHILD else "[]"
-    text = f'schema = "bampipe.model/1"\nname = "{model}"\ndevice = "bam"\neffects = {effects}\n'
-    write_text(root / f"models/{model}/model.toml", text)
+    made_results.write_model(root, model, *(("stribeck:yaw",) if model == CHILD else ()))
     named = {
         name: {
             "estimate": value, "sd": sd, "unit": unit, "at_bound": name == "stribeck.yaw.speed",

@@ -373,7 +373,10 @@ def test_green_means_that_no_check_failed(own_run: Path) -> None:
     assert "callout good" not in page
 
 
-def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(own_run: Path) -> None:
+def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
+    own_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(typeset, "render_pdf", lambda *_: b"")
     name, formula = "bump_by_position:yaw", "height*exp(-((q - place)/width)**2)"
     curve = {
         "variable": "position", "variable_unit": "rad", "at": [-0.1, 0.0, 0.1],

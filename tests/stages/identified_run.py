@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from made_results import write_model
 from run_folders import write_ingested
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.files import write_text
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
 from bampipe.stages import filter as filter_stage
@@ -27,7 +27,6 @@ TRUTH = {
     "viscous.yaw": 4.2, "coulomb.yaw": 1.05, "viscous.pitch": 3.6, "coulomb.pitch": 2.2,
     "viscous.extension": 13.0, "coulomb.extension": 3.5, "mass": 3.5,
 }  # fmt: skip
-MODEL = 'schema = "bampipe.model/1"\nname = "base"\ndevice = "bam"\neffects = []\n'
 
 
 def simulated_run(
@@ -78,7 +77,7 @@ def recorded_run(root: Path, session: Path) -> RunFolder:
 
 def _filtered(run: RunFolder) -> RunFolder:
     filter_stage.execute(run, run.root, filter_stage.Config(), silent)
-    write_text(run.root / "models/base/model.toml", MODEL)
+    write_model(run.root, "base")
     return run
 
 

@@ -1,5 +1,6 @@
 """Logs such as other labs keep, made from known physics: a robot joint and a magnetic damper."""
 
+import math
 from functools import cache
 from pathlib import Path
 
@@ -19,18 +20,18 @@ def _joint_log(seed: int, seconds: float) -> dict[str, np.ndarray]:
     rng = np.random.default_rng([31, seed])
     dt = 5e-4
     t = np.arange(0.0, seconds, dt)
-    q, qd, current = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
+    q, qd, current = ([0.0] * len(t) for _ in range(3))
     tones = [
         (a, 2 * np.pi * f, p)
         for a, f, p in zip(
             (0.5, 0.3, 0.2), rng.uniform(0.15, 0.9, 3), rng.uniform(0, 6.28, 3), strict=True
         )
     ]
+    wanted = sum(a * (np.sin(w * t + p) - np.sin(p)) for a, w, p in tones).tolist()
     for k in range(len(t) - 1):
-        wanted = sum(a * np.sin(w * t[k] + p) - a * np.sin(p) for a, w, p in tones)
-        current[k] = 25.0 * (wanted - q[k]) - 1.5 * qd[k]
-        friction = VISCOUS * qd[k] + COULOMB * np.tanh(qd[k] / 2e-3)
-        torque = PER_AMPERE * current[k] - friction - MOMENT * np.sin(q[k])
+        current[k] = 25.0 * (wanted[k] - q[k]) - 1.5 * qd[k]
+        friction = VISCOUS * qd[k] + COULOMB * math.tanh(qd[k] / 2e-3)
+        torque = PER_AMPERE * current[k] - friction - MOMENT * math.sin(q[k])
         qd[k + 1] = qd[k] + dt * torque / INERTIA
         q[k + 1] = q[k] + dt * qd[k + 1]
     current[-1] = current[-2]
@@ -69,11 +70,6 @@ def damper_log(seed: int, seconds: float = 12.0) -> dict[str, np.ndarray]:
     }
 
 
-DAMPER_UNITS = {
-    "Time": "s", "Displacement": "mm", "Velocity": "mm/s", "Force": "N", "Current": "A",
-}  # fmt: skip
-
-
 def write_table(path: Path, table: dict[str, np.ndarray], form: str = "%.7g") -> None:
     """Columns of numbers with a header, between commas or as Parquet."""
     if path.suffix == ".parquet":
@@ -91,15 +87,3 @@ def write_joint_logs(folder: Path, count: int = 3) -> None:
         names = " ".join(columns)
         table = np.column_stack(list(columns.values()))
         np.savetxt(folder / f"run_{seed}.txt", table, fmt="%.6f", header=names)
-
-
-def write_damper_logs(folder: Path, count: int = 3) -> None:
-    """Semicolons, decimal commas, remarks above and a line of units, as of a German test stand."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(count):
-        columns = damper_log(seed)
-        lines = ["Pruefstand 2", "Probe;MR-3", "", ";".join(columns)]
-        lines.append(";".join(DAMPER_UNITS[name] for name in columns))
-        for row in zip(*columns.values(), strict=True):
-            lines.append(";".join(f"{cell:.5f}".replace(".", ",") for cell in row))
-        (folder / f"versuch{seed}.csv").write_text("\r\n".join(lines) + "\r\n")

@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_results import write_result
+from made_results import write_model, write_result
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model import ModelFile
 from bampipe.declarations.model_file import read_estimate
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
@@ -22,7 +21,7 @@ from bampipe.stages import compare
 def add(root: Path, name: str, parent: str, **errors: float) -> None:
     """A model version with these held-out errors by axis."""
     effects = tuple(part.replace(".", ":") for part in name.split("+")[1:])
-    models.write(root, ModelFile(name=name, parent=parent, device="bam", effects=effects))
+    write_model(root, name, *effects, parent=parent)
     write_result(root, IdentifyResult, model=name, parameters={})
     axes = {axis: {"held_out_rmse": error, "unit": "N.m"} for axis, error in errors.items()}
     write_result(root, ValidateResult, model=name, axes=axes)

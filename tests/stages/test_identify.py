@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import schema_misfits
-from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
+from identified_run import RESOLUTION, TRUTH, simulated_run
+from made_results import write_model
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
-from bampipe.files import read_json, write_text
+from bampipe.files import read_json
 from bampipe.identification.filter_run import MotionLost
 from bampipe.progress import silent
 from bampipe.run.state import configure
@@ -68,13 +69,6 @@ def test_intervals_hold_on_a_simulated_session(published: tuple[Path, dict]) -> 
     for name in ("viscous.yaw", "coulomb.yaw", "viscous.extension", "coulomb.extension"):
         entry = content["parameters"][name]
         assert 0.75 < entry["filter_sd"] / entry["bound_sd"] < 1.5, name
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("factor", [0.2, 5.0])
-def test_start_does_not_matter(simulated: RunFolder, factor: float) -> None:
-    content = identified(simulated, replace(FAST, start_factor=factor))
-    assert_recovered(content, TRUTH)
 
 
 def test_least_squares_stand_in_where_the_filter_loses_the_motion(
@@ -155,8 +149,7 @@ def test_a_motion_that_no_noise_explains_is_refused(tmp_path: Path) -> None:
 
 def test_a_model_with_a_delay_gets_no_timing_of_its_own(simulated: RunFolder) -> None:
     """The two shift the forces alike: together neither would be known."""
-    late = MODEL.replace("[]", '["force_delay"]').replace('"base"', '"base+force_delay"', 1)
-    write_text(simulated.path("models/base+force_delay/model.toml"), late)
+    write_model(simulated.root, "base+force_delay", "force_delay")
     settings = replace(FAST, model="base+force_delay", method="least-squares")
     content = identified(simulated, settings)
     assert content["input_timing"] == {"estimate": 0.0, "sd": 0.0, "unit": "s"}
@@ -169,9 +162,8 @@ def test_the_force_noise_moves_the_encoder_of_an_axis_that_winds_up(tmp_path: Pa
     """Without that in the noise of the readings, the filter gave the friction as 14 for 4.2."""
     name = "transmission_compliance.yaw.compliance"
     wound = {"effect": "transmission_compliance:yaw", "hidden": {name: 2e-3}}
-    run = simulated_run(tmp_path, seconds=6.0, **wound)
-    text = MODEL.replace("[]", '["transmission_compliance:yaw"]')
-    write_text(run.path("models/base/model.toml"), text)
+    run = simulated_run(tmp_path, seconds=4.0, **wound)
+    write_model(run.root, "base", "transmission_compliance:yaw")
     content = identified(run, replace(FAST, method="ukf"))
     assert_recovered(content, TRUTH)
     assert content["parameters"][name]["estimate"] == pytest.approx(2e-3, rel=5e-3)
@@ -189,7 +181,7 @@ def test_friction_that_falls_within_a_step(tmp_path: Path) -> None:
     """
     hidden = {"stribeck.extension.force": 3.5, "stribeck.extension.speed": 0.017}
     run = simulated_run(tmp_path, effect="stribeck:extension", hidden=hidden)
-    write_text(run.path("models/base/model.toml"), MODEL.replace("[]", '["stribeck:extension"]'))
+    write_model(run.root, "base", "stribeck:extension")
     squares = identified(run, replace(FAST, method="least-squares"))["parameters"]
     for name, value in hidden.items():
         assert abs(squares[name]["estimate"] - value) < 2.0 * squares[name]["sd"], name
@@ -227,8 +219,7 @@ def test_what_cannot_be_identified_is_said(squares: tuple[Path, dict]) -> None:
 @pytest.mark.long
 def test_two_terms_of_one_shape_are_said_to_move_together(simulated: RunFolder) -> None:
     """Friction that grows with the rod's load and Coulomb friction: nearly the same here."""
-    text = MODEL.replace("[]", '["gravity_compensator_mistuned", "base_tilt"]')
-    write_text(simulated.path("models/two/model.toml"), text.replace('"base"', '"two"', 1))
+    write_model(simulated.root, "two", "gravity_compensator_mistuned", "base_tilt")
     content = identified(simulated, replace(FAST, method="least-squares", model="two"))
     weak = content["identifiability"]["weak_directions"]
     assert any("mass" in direction["members"] for direction in weak), weak

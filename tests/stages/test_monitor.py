@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import Command
-from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
-from made_results import write_result
+from identified_run import RESOLUTION, TRUTH, simulated_run
+from made_results import write_model, write_result
 
 from bampipe.cli.monitor import _Output, follow
 from bampipe.data.run_folder import RunFolder
@@ -23,7 +23,7 @@ from bampipe.data.store import read_parquet
 from bampipe.data.stream import SampleStream
 from bampipe.errors import InputError
 from bampipe.estimate.unscented import Trial, filter_trials
-from bampipe.files import read_json, write_text
+from bampipe.files import read_json
 from bampipe.monitor.monitor import Monitor
 from bampipe.monitor.start import MonitorOptions, list_layouts, open_stream, start_from_run
 from bampipe.physics import Model, compile_model, registry
@@ -125,8 +125,7 @@ def test_begins_where_the_mechanism_is_and_not_its_encoder(tmp_path: Path) -> No
     """An encoder that reads 5 % too much: where it points, the mechanism never was."""
     hidden = {"encoder_scale.yaw.error": -0.05}
     found = simulated_run(tmp_path, trials=1, effect="encoder_scale:yaw", hidden=hidden)
-    wrong = MODEL.replace("[]", '["encoder_scale:yaw"]')
-    write_text(found.path("models/base/model.toml"), wrong)
+    write_model(found.root, "base", "encoder_scale:yaw")
     monitor = monitor_of(start_from_run(known(found, TRUTH | hidden), "base", MonitorOptions()))
     values = samples(found, "t00")
     push(monitor, values.head(5))

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from independent import joint
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
@@ -14,28 +15,6 @@ from bampipe.files import read_json
 from bampipe.progress import silent
 from bampipe.stages import ingest
 
-DEVICE = """
-schema = "bampipe.device/1"
-name = "joint"
-[coordinates.joint]
-kind = "rotary"
-[constants]
-torque_constant = { value = 1.5, unit = "N.m/A" }
-[energy]
-kinetic = "inertia*ddt(joint)**2/2"
-[inputs]
-force = ["current"]
-force_unit = "A"
-[applied]
-joint = "torque_constant*current"
-[friction.joint]
-viscous = { unit = "N.m.s/rad", prior = 0.1, sd = 0.1, lower = 0.0 }
-coulomb = { unit = "N.m", prior = 0.1, sd = 0.1, lower = 0.0 }
-[parameters.inertia]
-unit = "kg.m2"
-prior = 0.05
-sd = 0.05
-"""
 HEAD = """
 schema = "bampipe.session/1"
 session_id = "arm"
@@ -64,7 +43,7 @@ def ingested(
 ) -> tuple[pd.DataFrame, pd.Series, dict]:
     """Samples, the trial's row and session.json of a session over one log."""
     folder.mkdir(exist_ok=True)
-    (folder / "joint.toml").write_text(DEVICE)
+    (folder / "joint.toml").write_text(joint.DEVICE)
     (folder / "log.csv").write_text(text)
     session = HEAD.format(rate=RATE, time=time, encoder=encoder, current=current)
     (folder / "session.toml").write_text(session)

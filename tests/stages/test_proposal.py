@@ -18,7 +18,6 @@ from other_labs import (
     VISCOUS,
     damper_log,
     joint_log,
-    write_damper_logs,
     write_joint_logs,
     write_table,
 )
@@ -129,17 +128,21 @@ def test_where_only_the_command_was_logged_it_is_the_input(tmp_path, column: str
 
 
 def test_a_damper_with_a_coil(tmp_path):
-    write_damper_logs(tmp_path / "damper")
-    session, proposal = proposed(tmp_path / "damper")
+    units = ("s", "mm", "mm/s", "N", "A")
+    for seed in (1, 2):
+        columns = zip(damper_log(seed).items(), units, strict=True)
+        table = {f"{name} [{unit}]": values for (name, values), unit in columns}
+        write_table(tmp_path / f"versuch{seed}.parquet", table)
+    session, proposal = proposed(tmp_path)
     assert session["sample_rate_hz"] == 1000 and proposal.fill_in == []
     (axis,) = session["encoders"].values()
-    assert axis["column"] == "Displacement" and axis["unit"] == "mm"
-    assert axis["velocity"] == {"column": "Velocity", "unit": "mm/s"}
-    assert session["force"]["columns"] == ["Force"] and session["force"]["unit"] == "N"
-    assert session["channels"]["coil_current"] == {"column": "Current", "unit": "A"}
-    device = tomllib.loads((tmp_path / "damper" / "device.toml").read_text())
+    assert axis["column"] == "Displacement [mm]" and axis["unit"] == "mm"
+    assert axis["velocity"] == {"column": "Velocity [mm/s]", "unit": "mm/s"}
+    assert session["force"]["columns"] == ["Force [N]"] and session["force"]["unit"] == "N"
+    assert session["channels"]["coil_current"] == {"column": "Current [A]", "unit": "A"}
+    device = tomllib.loads((tmp_path / "device.toml").read_text())
     assert device["inputs"]["prescribed"] is True
-    found = samples(tmp_path / "damper", tmp_path / "out", "versuch2")
+    found = samples(tmp_path, tmp_path / "out", "versuch2")
     truth = damper_log(2)
     np.testing.assert_allclose(found["q_carriage"], 1e-3 * truth["Displacement"], atol=1e-8)
     np.testing.assert_allclose(found["force_drive"], truth["Force"], atol=1e-5)
@@ -353,8 +356,9 @@ def test_each_recording_of_a_file_is_a_trial(tmp_path, command: Command, header:
     assert [trial.get("recording") for trial in session["trials"]] == [1, 2, None]
     begins = 1002 + len(header)
     assert f"a.csv holds 2 recordings, which begin again at row {begins}" in proposal.check
+    trials = samples(tmp_path, tmp_path / "out", None).groupby("trial_id")
     for trial, rate in (("a", 1.0), ("a_2", 1.5), ("b", 1.0)):
-        found = samples(tmp_path, tmp_path / "out", trial)
+        found = trials.get_group(trial)
         np.testing.assert_allclose(found["t"], t[: len(found)], atol=1e-9)
         np.testing.assert_allclose(found["q_joint"], np.sin(rate * t[: len(found)]), atol=1e-6)
     text = re.sub("recording = .*", "", (tmp_path / "session.toml").read_text())
@@ -392,7 +396,7 @@ def test_of_two_joints_without_a_drawing_a_position_has_its_own_drive(tmp_path):
 
 def test_the_files_of_one_recording_are_joined(tmp_path):
     """One quantity a file, as matrices without names; rows that one file has more are left out."""
-    log = joint_log(3)
+    log = joint_log(3, seconds=10.0)
     for k in (1, 2):
         rows = np.column_stack([np.deg2rad(log["joint_angle"]), log["joint_velocity"]])
         np.savetxt(tmp_path / f"excit_ang_{k}.txt", rows[k:], "%.8f")
@@ -705,3 +709,46 @@ def test_what_a_drive_moves_is_the_axis_and_a_named_force_comes_before_looks(tmp
     v = np.gradient(q, t)
     table = {"t": t, "A": np.gradient(v, t), "D": q, "V": v, "F": u}
     assert proposed_for(table, tmp_path / "b")[0]["force"]["columns"] == ["F"]
+
+
+T, Q, TAU = machine(3)
+MS = np.rint(1e3 * (T - T[0])).astype(int) + 400
+
+
+def write_clocked(folder: Path, columns: dict[str, np.ndarray], above: str = "") -> None:
+    rows = np.column_stack([*columns.values(), np.rad2deg(Q), TAU])
+    head = ",".join((*columns, "angle_deg", "torque_nm"))
+    np.savetxt(folder / "a.csv", rows, "%.7f", ",", header=above + head, comments="")
+
+
+@pytest.mark.parametrize(
+    "clock",
+    [{"sec": MS // 1000, "msec": MS % 1000}, {"millis": MS % 1000}],
+    ids=["two columns", "restarts every second"],
+)
+def test_a_clock_that_starts_again_every_second_is_one_clock(tmp_path, clock):
+    write_clocked(tmp_path, clock)
+    session, proposal = proposed(tmp_path)
+    assert not proposal.fill_in and "recording" not in session["trials"][0]
+    found = samples(tmp_path, tmp_path / "out", None)
+    assert len(found) == len(T)
+
+
+@pytest.mark.parametrize("line", ["Sampling Rate (Hz),{hz:g}", "# dt: {dt:g}", "fs = {khz:g} kHz"])
+def test_a_rate_above_the_table_is_that_of_its_samples(tmp_path, line: str):
+    dt = float(np.median(np.diff(T)))
+    write_clocked(tmp_path, {}, line.format(hz=1 / dt, dt=dt, khz=1e-3 / dt) + "\n")
+    session, proposal = proposed(tmp_path)
+    assert not proposal.fill_in and session["time"]["unit"] == "samples"
+    assert session["sample_rate_hz"] == pytest.approx(1 / dt, rel=1e-5)
+
+
+def test_what_json_says_of_a_channel_elsewhere_is_its_own(tmp_path):
+    counts = {"angle": np.rint(np.rad2deg(Q) / 0.01), "torque": np.rint(1e3 * TAU)}
+    channels = {"angle": {"gain": 0.01, "unit": "deg"}, "torque": {"gain": 0.001, "unit": "Nm"}}
+    data = {name: values.astype(int).tolist() for name, values in counts.items()}
+    meta = {"fs": 200, "channels": channels}
+    (tmp_path / "a.json").write_text(json.dumps({"meta": meta, "data": data}))
+    session, proposal = proposed(tmp_path)
+    assert session["encoders"]["joint"]["unit"] == "0.01 deg" and not proposal.fill_in
+    assert session["force"]["unit"] == "mN.m"

@@ -7,6 +7,8 @@ import pytest
 import bampipe
 from bampipe.files import read_json
 
+pytestmark = pytest.mark.long
+
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "sessions"
 AXES = ("yaw", "pitch", "extension")
 TOLERANCE = {"viscous": 0.03, "coulomb": 0.05, "mass": 0.01}
@@ -24,7 +26,7 @@ method = "{}"
     [
         ("open-01", "auto", None, "identify"),
         ("open-02", "least-squares", "yaw", "validate"),
-        pytest.param("open-09", "auto", None, "validate", marks=pytest.mark.long),
+        ("open-09", "auto", None, "validate"),
     ],
 )
 def test_a_session_agrees_with_its_truth(

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import schema_misfits
-from identified_run import MODEL, recorded_run, simulated_run
+from identified_run import recorded_run, simulated_run
+from made_results import write_model
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet, write_parquet
 from bampipe.errors import InputError
-from bampipe.files import read_json, write_json, write_text
+from bampipe.files import read_json, write_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
 from bampipe.run.state import configure
@@ -87,11 +88,10 @@ def test_what_brakes_do_is_judged_in_the_trials_in_which_they_act(tmp_path: Path
     truth = simulation.simulate_session(tmp_path / "session", hidden)
     run = recorded_run(tmp_path / "run", tmp_path / "session")
     ratios = {}
-    for name, effects in (("base", "[]"), ("lag", '["brake_lag"]')):
-        text = MODEL.replace("[]", effects).replace('"base"', f'"{name}"', 1)
-        write_text(run.path(f"models/{name}/model.toml"), text)
+    for name, effects in (("base", ()), ("lag", ("brake_lag",))):
+        write_model(run.root, name, *effects)
         identify.execute(run, run.root, replace(SQUARES, model=name), silent)
-        content = validated(run, validate.Config(model=name))
+        content = validated(run, validate.Config(model=name, repeats=3))
         ratios[name] = {
             axis: entry["held_out_rmse"] / entry["noise_floor"]
             for axis, entry in content["axes"].items()
