@@ -82,8 +82,9 @@ def weigh_sets(
         given: effects of the model diagnosed, which are not in question.
     """
     costs = by_noise.with_independent(fit.count_independent(criteria))
-    # A fit may gain less than its linear problem promised.
-    shortfall = {k: c - by_noise.cost(k) for c, k in pool.values()}
+    # A fit may gain less than its linear problem promised, in the same proportion to the samples.
+    fewer = costs.problem.independent.sum() / max(by_noise.problem.independent.sum(), 1e-300)
+    shortfall = {k: fewer * (c - by_noise.cost(k)) for c, k in pool.values()}
     pool = {n: (costs.cost(k) + shortfall[k], k) for n, (_, k) in pool.items()}
     none = costs.cost(())
     own = [e for e in costs.problem.absence if e not in given]
