@@ -77,3 +77,10 @@ def test_no_ripple_falls_between_two_values_that_are_tried():
     on_travel = np.array(values) * 0.25 / (2.0 * np.pi)
     assert on_travel[-1] == pytest.approx(30.0)
     assert np.diff(on_travel).max() <= 0.6
+
+
+def test_no_resonance_falls_between_two_frequencies_that_are_tried():
+    """A part that swings with a twentieth of critical damping shows within a tenth of it."""
+    frequency = range_of("flexible_load:carriage", "frequency")
+    values = [frequency.interpolate(share) for share in np.linspace(0.0, 1.0, frequency.count)]
+    assert np.divide(values[1:], values[:-1]).max() < 1.12

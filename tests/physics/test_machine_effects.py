@@ -199,6 +199,7 @@ def test_a_flexible_load_is_rigid_below_its_frequency_and_left_behind_above_it()
         q, qd, qdd = (1e-3 * w**k * np.sin(w * t + k * np.pi / 2)[:, None] for k in range(3))
         u = np.zeros((t.size, len(system.inputs)))
         z = system.memory(q, qd, qdd, u, values, t)
+        assert z[0] == pytest.approx([0.0, qd[0, 0]])  # it starts with what carries it
         needed = system.required(q, qd, qdd, z, u, values)[:, 0]
         settled = t > 10.0
         mass = needed[settled] @ qdd[settled, 0] / (qdd[settled, 0] @ qdd[settled, 0])

@@ -71,3 +71,18 @@ def test_trials_that_each_go_one_way_tell_no_offset(tmp_path: Path):
     for number, ways in enumerate((0.5, -0.5, 0.9, -0.9)):
         write_trial(tmp_path / f"t{number}.parquet", number, 0.8 * np.sign(ways), ways)
     assert filtered(tmp_path, tmp_path / "out")[0]["force_offsets"] == {}
+
+
+def test_a_damper_that_is_stiffer_one_way_tells_no_offset(tmp_path: Path):
+    """Its mean force grows with the speed of the trial, as if the sensor were zeroed anew."""
+    t, rng = np.arange(6000) / 500.0, np.random.default_rng(3)
+    for number, (hertz, travel) in enumerate([(0.3, 0.05), (1.6, 0.05), (3.0, 0.03), (6.0, 0.012)]):
+        x = travel * np.sin(2 * np.pi * hertz * t) * np.minimum(1.0, t)
+        v = np.gradient(x, t)
+        force = np.where(v > 0.0, 2200.0, 1100.0) * v + 60.0 * np.tanh(v / 3e-3) - 800.0 * x
+        force += rng.normal(0.0, 4.0, len(t))
+        columns = {"time_s": t, "displacement_mm": 1e3 * x, "force_N": force}
+        write_table(tmp_path / f"t{number}.parquet", columns)
+    result, _ = filtered(tmp_path, tmp_path / "out")
+    assert result["force_offsets"] == {}
+    assert len(read_parquet(tmp_path / "out/filter/kinematics.parquet", trial="t3")) > 5000
