@@ -45,6 +45,9 @@ Seed = tuple[int, ...]
 _MOST_STEPS = 24
 _MOST_TRIED, _LEAST_DAMPING = 5, 0.01
 """Number of dampings that are tried for a step, each ten times the last, and the first of them."""
+_LATER = 0.03
+"""Change of the input delay, in radians at the highest frequency of the band, for which trials are
+shifted: the column of the delay is its first derivative."""
 _CONVERGED = 0.2
 """A fit ends when a step promises a smaller fall of the negative log likelihood, nats."""
 _LEAST_FALL = 0.02
@@ -142,16 +145,27 @@ class Session:
         )
 
     def linearise(
-        self, spec: ModelSpec, p: Array, like: Linearisation | None = None, judged: bool = False
+        self,
+        spec: ModelSpec,
+        p: Array,
+        like: Linearisation | None = None,
+        judged: bool = False,
+        late_s: float = 0.0,
     ) -> Linearisation:
         """Linearise the model of ``spec`` at parameters ``p``, (n_p,).
 
-        The trials are those that choose a model or, if asked, those by which it is ``judged``.
+        The trials are those that choose a model or, if asked, those by which it is ``judged``;
+        they have the input delay of ``like`` and ``late_s`` more.
         """
         t = self._trial_subsets[judged]
+        motions, timing = (like.motions, like.timing) if like else (t.motions, t.timing)
+        if late_s:
+            low, high = timing[0] - late_s, timing[1] - late_s
+            motions = [m.with_input_timing(t.timing[0] - low) for m in t.motions]
+            timing = low, high
         return linearise_fit(
-            system_of(spec), t.motions, t.band, p, t.folds,
-            most_iterations=0, timing=t.timing, like=like,
+            system_of(spec), motions, t.band, p, t.folds,
+            most_iterations=0, timing=timing, like=like,
         )  # fmt: skip
 
     @cached_property
@@ -284,8 +298,11 @@ class Session:
                 p = linearisation.p.copy()
                 p[list(linearisation.free)] += step[:count]
                 p = np.clip(p, *bounds_of(linearisation.system))
+                late_s = float(step[count]) if linearisation.by_timing else 0.0
+                if 2.0 * np.pi * max(self.trials.band.cutoff_hz) * abs(late_s) < _LATER:
+                    late_s = 0.0
                 try:
-                    moved = self.linearise(spec, p, linearisation)
+                    moved = self.linearise(spec, p, linearisation, late_s=late_s)
                     tried = pose_problem(likelihood, moved)
                     there = tried.solve_nuisance(count).cost
                 except NotFinite:

@@ -60,7 +60,7 @@ def pose_problem(likelihood: Likelihood, linearisation: Linearisation) -> "Linea
     of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
     n_timing, none = len(of_timing), np.zeros(n_q)
     precision = np.concatenate([linearisation.precision, of_timing, none + 1.0, none + 1.0])
-    known = np.concatenate([linearisation.known, np.zeros(n_timing), none + 1.0, none])
+    known = np.concatenate([linearisation.known, [sum(timing) / 2] * n_timing, none + 1.0, none])
     lower = np.concatenate([linearisation.lower, timing[:1], none, none])
     upper = np.concatenate([linearisation.upper, timing[1:], none + MOST_BIAS, none + MOST_BIAS])
     y = [
