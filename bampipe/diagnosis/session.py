@@ -126,6 +126,7 @@ class Session:
     Attributes:
         jobs: number of worker processes; seed: seed of the noise of replicates.
         requested_effects: candidates among the effects that are weighed only on request.
+        keeps_timing: whether fits leave the input delay of the trials to their linear problem.
     """
 
     trials: MeasuredTrials
@@ -133,6 +134,7 @@ class Session:
     jobs: int = 1
     seed: int = 0
     requested_effects: tuple[str, ...] = ()
+    keeps_timing: bool = False
 
     def candidate_names(self, spec: ModelSpec, without: Collection[str] = ()) -> tuple[str, ...]:
         """Return the effects that the model of ``spec`` could have, except its own."""
@@ -288,6 +290,7 @@ class Session:
         if sum(map(len, problem.y)) <= count:
             raise ValueError("fewer samples clear of standstill than parameters")
         here, damping = problem.solve_nuisance(count).cost, 0.0
+        highest_hz = max(self.trials.band.cutoff_hz)
         for _ in range(_MOST_STEPS):
             promised = problem.solve()
             if here - promised.cost < _CONVERGED:
@@ -298,9 +301,10 @@ class Session:
                 p = linearisation.p.copy()
                 p[list(linearisation.free)] += step[:count]
                 p = np.clip(p, *bounds_of(linearisation.system))
-                late_s = float(step[count]) if linearisation.by_timing else 0.0
-                if 2.0 * np.pi * max(self.trials.band.cutoff_hz) * abs(late_s) < _LATER:
-                    late_s = 0.0
+                late_s = 0.0
+                if linearisation.by_timing and not self.keeps_timing:
+                    is_coarse = 2.0 * np.pi * highest_hz * abs(step[count]) > _LATER
+                    late_s = is_coarse * float(step[count])
                 try:
                     moved = self.linearise(spec, p, linearisation, late_s=late_s)
                     tried = pose_problem(likelihood, moved)

@@ -282,7 +282,7 @@ def fit_squares(
     Raises:
         ValueError: fewer samples are clear of standstill than there are parameters.
     """
-    session = Session(trials, Criteria(replicates=_REPLICATES))
+    session = Session(trials, Criteria(replicates=_REPLICATES), keeps_timing=True)
     problem = problem_of(system, trials.motions, trials.band, timing=trials.timed)
     # Shapes of effects keep the values of their search, which stopping friction would bias here.
     effects = () if problem.linear else system.model.effects

@@ -260,7 +260,8 @@ def _cancel_residual(fitted: ModelOnTrial) -> Array:
     """Change the measured force by Newton steps until no residual is left, (T, n_f).
 
     An effect that takes a part of the force requires more of it. A force behind an internal state,
-    such as a lag, is assumed to have a slope. What no force can cancel stays, as in a gap.
+    such as a lag, is assumed to have a slope. What no force can cancel stays, as in a gap; raises
+    `Runaway` if that is all.
     """
     system, motion, p = fitted.system, fitted.motion, fitted.p
     columns = force_columns(system)
@@ -282,6 +283,8 @@ def _cancel_residual(fitted: ModelOnTrial) -> Array:
         steep = np.abs(slope) > _LEAST_SLOPE * np.abs(left)
         share = np.divide(left, slope, out=np.ones_like(left), where=steep)
         u[:, columns] -= system.least_force(motion.q, share * left, u, p)
+    if least == first > 0.0:  # a replicate with the measured residual would lack what that lacks
+        raise Runaway("no force was found that moves the model as the machine moved")
     return kept[:, columns]
 
 

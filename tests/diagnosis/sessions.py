@@ -80,7 +80,7 @@ def take_timing_off(trials: MeasuredTrials, spec: ModelSpec) -> MeasuredTrials:
     """The trials with the timing of their inputs as found by least squares, and open beside it."""
     half = 0.5 / trials.band.rate_hz
     timed = replace(trials, limit_s=half, timed=True)
-    fit = fit_from_priors(Session(timed, Criteria()), spec)
+    fit = fit_from_priors(Session(timed, Criteria(), keeps_timing=True), spec)
     change = fit.problem.to_parameters @ fit.solution.base
     return timed.with_input_timing(float(change[len(fit.linearisation.free)]))
 
