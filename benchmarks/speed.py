@@ -28,6 +28,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -314,23 +315,29 @@ def measure(trees: Mapping[str, Tree], parts: Sequence[str], logs: Path, short: 
     return list(rows.values())
 
 
-def write_table(content: Mapping[str, object]) -> str:
-    """The rows as Markdown, with ratios where there is another commit."""
-    beside = content["beside"]
-    lines = [
-        f"{content['machine']}, load {content['load']} at the beginning; "
-        + ", ".join(f"{k} {v}" for k, v in dict(content["versions"]).items()),  # type: ignore[call-overload]
-        "",
-        f"| | unit | {content['commit']} |" + (f" {beside} | ratio |" if beside else ""),
-        "|-|-|-|" + ("-|-|" if beside else ""),
-    ]
-    for row in content["rows"]:  # type: ignore[attr-defined]
-        here, there = row.get("this"), row.get("other")
-        line = f"| {row['title']} | {row['unit']} | {_number(here)} |"
-        if beside:
-            line += f" {_number(there)} | {_number(here / there if here and there else None)} |"
-        lines.append(line)
-    return "\n".join(lines)
+def write_table(content: Mapping[str, Any]) -> str:
+    """The rows as Markdown: with ratios where there is another commit, else a line a process."""
+    here, beside = content["commit"], content["beside"]
+    versions = ", ".join(f"{name} {number}" for name, number in content["versions"].items())
+    head = f"{content['machine']}, load {content['load']} at the beginning; {versions}"
+    if beside:
+        table = [f"| | unit | {here} | {beside} | ratio |", "|-|-|-|-|-|"]
+        for row in content["rows"]:
+            ours, theirs = row.get("this"), row.get("other")
+            numbers = ours, theirs, ours / theirs if ours and theirs else None
+            table.append(
+                f"| {row['title']} | {row['unit']} | {' | '.join(map(_number, numbers))} |"
+            )
+        return "\n".join([head, "", *table])
+    lines: dict[str, list[str]] = {}
+    for row in content["rows"]:
+        title, _, kind = row["title"].partition(": ")
+        place = ("CPU", "memory").index(kind) + 1 if kind in ("CPU", "memory") else 0
+        line = lines.setdefault(title if place else row["title"], ["", "", ""])
+        line[place] = _number(row["this"]) + ("" if place else f" {row['unit']}")
+    table = [f"| | {here} | CPU, s | memory, MB |", "|-|-|-|-|"]
+    table += [f"| {title} | {' | '.join(line)} |" for title, line in lines.items()]
+    return "\n".join([head, "", *table])
 
 
 def _number(value: float | None) -> str:
