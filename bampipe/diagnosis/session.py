@@ -45,7 +45,7 @@ Seed = tuple[int, ...]
 _MOST_STEPS = 24
 _MOST_TRIED, _LEAST_DAMPING = 5, 0.01
 """Number of dampings that are tried for a step, each ten times the last, and the first of them."""
-_LATER = 0.03
+_COARSE_SHIFT = 0.03
 """Change of the input delay, in radians at the highest frequency of the band, for which trials are
 shifted: the column of the delay is its first derivative."""
 _CONVERGED = 0.2
@@ -303,7 +303,7 @@ class Session:
                 p = np.clip(p, *bounds_of(linearisation.system))
                 late_s = 0.0
                 if linearisation.by_timing and not self.keeps_timing:
-                    is_coarse = 2.0 * np.pi * highest_hz * abs(step[count]) > _LATER
+                    is_coarse = 2.0 * np.pi * highest_hz * abs(step[count]) > _COARSE_SHIFT
                     late_s = is_coarse * float(step[count])
                 try:
                     moved = self.linearise(spec, p, linearisation, late_s=late_s)

@@ -12,7 +12,7 @@ from bampipe.trials.linearisation import Linearisation
 _SPEEDS = 12
 """Classes of speed in which the variance of replicates is averaged, finer at low speeds."""
 MOST_BIAS = 1.5
-"""Upper bound of gamma, the factor of the stopping bias."""
+"""Upper bound of beta and gamma, the factors of the common and of the stopping bias."""
 
 
 @dataclass(frozen=True)
