@@ -206,10 +206,10 @@ class Session:
         on its path, so that there only the width of the sign changes the friction.
         """
         t, nothing = self.trials, [np.zeros_like(r) for r in linearisation.residual]
+        if keep_motion(linearisation.fitted):
+            return nothing
         if linearisation.system.model.device.robot is not None:
-            return (
-                nothing if keep_motion(linearisation.fitted) else _narrower_friction(linearisation)
-            )
+            return _narrower_friction(linearisation)
         narrow = system_of(spec.with_sign_widths(_STOPPING_WIDTH))
         kept = ([ModelOnTrial(narrow, linearisation.p, [m])] for m in linearisation.motions)
         if any(map(keep_motion, kept)):
