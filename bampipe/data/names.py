@@ -1,4 +1,4 @@
-"""What the name of a column says of it: its words, its unit, and what it is."""
+"""Column names parsed into words, the unit and the role of the quantity that they name."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -33,7 +33,7 @@ _UNIT_WORDS: Mapping[str, list[str]] = {
     role: text.split() for role, text in VOCABULARY["units_in_names"].items()
 }
 _OF_FIRST, _OF_UNIT, _OF_WORD, _OF_SUFFIX, _OF_LETTER, _OF_HINT = 6, 5, 4, 3, 2, 1
-"""Weights of what tells the role of a column, from words for what is asked for to mere hints."""
+"""Weights of the evidence for a role, from words such as setpoint down to mere hints."""
 
 
 def words(name: str) -> list[str]:
@@ -56,7 +56,7 @@ def _parts_of(word: str) -> list[str]:
 
 
 def role_of(name: str, stated: str) -> str:
-    """What a column is, by its name and the unit that a file states; "" where neither tells.
+    """Return the role of a column by its name and stated unit; "" if neither suggests one.
 
     A column of a part of a recording, as ``part:column``, may be named by the part.
     """
@@ -75,7 +75,7 @@ def role_of(name: str, stated: str) -> str:
 
 
 def _evidence(name: str, stated: str) -> Iterator[tuple[str, float]]:
-    """Roles that a name and a stated unit speak for, and how much each does."""
+    """Yield each role that a name or a stated unit suggests, with the weight of the evidence."""
     plain, said = name.strip(), words(name)
     clock = plain.lower() in _UNIT_WORDS["time"] or plain.lower().startswith("x_value")
     if stated == "datetime" or clock or plain.rpartition(".")[2] == "ts":  # Ts: rather an interval

@@ -53,7 +53,7 @@ class Notes:
 
         Args:
             question: its name in ``sentences.toml``, which says where to look it up, too.
-            of: what it is asked of; what is asked of several becomes one question.
+            of: the item that the question concerns; a question about several is asked once.
             known: the other fields of its text.
         """
         own = _SENTENCES[question]

@@ -17,7 +17,7 @@ from bampipe.setup.proposal.notes import sentence
 from bampipe.setup.proposal.positions import in_counts
 
 _NAMELESS = word_set("nameless")
-_FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "eff", "torque", "tau", "motor", "actuator", "drive"}
+_FROM_A_MOTOR = REFERENCE_WORDS | word_set("driven")
 _DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
 _PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
 _FASTEST_S = 2e-4
