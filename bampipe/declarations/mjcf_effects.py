@@ -165,7 +165,9 @@ def _presliding(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
     if left < 0.0:
         return False
     w.friction[item.target] = left
-    w.add_bristles(item.target, v.force / v.distance, 0.0, v.force, v.force, 1.0)
+    level = v.force * (1.0 + getattr(v, "rise", 0.0))
+    speed = getattr(v, "speed", 1.0)
+    w.add_bristles(item.target, v.force / v.distance, 0.0, v.force, level, speed)
     return True
 
 
@@ -210,7 +212,7 @@ _WRITERS: Mapping[str, _Act] = {
     "quadratic_drag": _drag,
     **dict.fromkeys(("upper_stop", "lower_stop"), _stop),
     **dict.fromkeys(("flexible_load", "loose_link"), _load),
-    "presliding": _presliding,
+    **dict.fromkeys(("presliding", "lugre"), _presliding),
     "stribeck": _stribeck,
     **{
         f"{what}_of_{how}": _pair

@@ -38,6 +38,11 @@ class Candidate:
         return self.name in self.system.timing_effects
 
     @property
+    def combines(self) -> int:
+        """Number of effects that it stands for."""
+        return self.system.model.effects[-1].effect.combines
+
+    @property
     def replaces_motion(self) -> bool:
         """Whether the effect changes the motion that the model sees, and nothing else."""
         return self.system.model.effects[-1].effect.kind == "measurement"

@@ -73,6 +73,9 @@ class SetCosts:
     ) -> None:
         self.dictionary, self.make, self.criteria = dictionary, make, criteria
         self.log_prior = log_prior(criteria, len(dictionary.candidates))
+        own = dictionary.linearisation.system.model.effects
+        self._combined = {item.name: item.effect.combines for item in own}
+        self._combined |= {name: c.combines for name, c in dictionary.candidates.items()}
         self.n_q = len(problem.y)
         self.bb = problem.sums()[0]
         self.atoms: dict[Key, Atom | None] = dict(known)
@@ -372,7 +375,9 @@ class SetCosts:
         """Return the cost of the prior of a set, less the priors of the effects it removes."""
         away = removed_effects(keys)
         saved = sum(self._penalty_of_own(name) for name in away)
-        return self.log_prior * (len(away) - len(added_effects(keys))) - saved
+        fewer = sum(self._combined[name] for name in away)
+        more = sum(self._combined[name] for name, _ in added_effects(keys))
+        return self.log_prior * (fewer - more) - saved
 
     def _penalty_of_own(self, name: str) -> float:
         """Return the cost of the priors of the parameters of one of the model's effects."""

@@ -144,7 +144,10 @@ def _find_penalty(comparison: Comparison, sums: Sums, number: int) -> Array:
     if alternative.slopes:
         information = information * np.outer(values[linear], values[linear])
     strengths = factors[:, None] * np.ones_like(typical)
-    return penalise(information, spread, strengths, len(item.searched_indices))
+    session = comparison.session
+    odds = log_prior(session.criteria, len(session.candidate_names(comparison.fit.spec)))
+    further = (1 - item.combines) * odds
+    return further + penalise(information, spread, strengths, len(item.searched_indices))
 
 
 def _cap_factor(factor: float) -> float:

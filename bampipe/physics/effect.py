@@ -127,6 +127,8 @@ class Effect(DeclaredFile):
     """true: offered for robots only; false: for other devices only"""
     devices: Distinct[Text] = ()
     """Devices that it suits; all if left out"""
+    combines: int = Field(default=1, ge=1)
+    """Number of effects that it stands for: a diagnosis gives it the prior of as many"""
     on_request: bool = False
     """Whether a diagnosis weighs it only where its setting `also` names it"""
     looks_like: Text = Field(description="Its trace in the residual")

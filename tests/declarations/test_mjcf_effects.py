@@ -39,6 +39,7 @@ EFFECTS = {
     "flexible_load:elbow_2": {"inertia": 0.15, "frequency": 40.0, "damping": 0.05},
     "presliding:elbow_2": {"force": 0.4, "distance": 0.05},
     "stribeck:elbow_2": {"force": 0.8, "speed": 0.3},
+    "lugre:elbow_2": {"force": 0.4, "rise": 0.5, "speed": 0.3, "distance": 0.05},
     "friction_of_sum:shoulder_1-elbow_2": {"viscous": 0.5, "coulomb": 0.5},
     "friction_of_difference:shoulder_1-elbow_2": {"viscous": 0.5, "coulomb": 0.5},
     "inertia_of_sum:shoulder_1-elbow_2": {"inertia": 0.1},

@@ -161,6 +161,7 @@ class Form:
         other_quantities: further quantities, ``x2``, ``x3`` in the shape, and their ranges.
         prefix: prefix of its name if the model has a form of that name already.
         takes_timing: always false, since no form delays a force.
+        combines: always 1, see `Candidate.combines`.
     """
 
     axis: Axis
@@ -174,6 +175,7 @@ class Form:
     other_quantities: tuple[tuple[Quantity, Span], ...] = ()
     prefix: str = ""
     takes_timing: ClassVar[bool] = False
+    combines: ClassVar[int] = 1
 
     @property
     def quantities(self) -> tuple[tuple[Quantity, Span], ...]:
