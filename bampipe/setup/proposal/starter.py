@@ -17,7 +17,8 @@ from bampipe.setup.proposal.notes import sentence
 from bampipe.setup.proposal.positions import in_counts
 
 _NAMELESS = word_set("nameless")
-_FROM_A_MOTOR = REFERENCE_WORDS | word_set("driven")
+_FROM_A_MOTOR, _FROM_A_SENSOR = REFERENCE_WORDS | word_set("driven"), word_set("sensed")
+_ON_A_BENCH = word_set("sliding")
 _DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
 _PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
 _FASTEST_S = 2e-4
@@ -139,7 +140,10 @@ def starter_device(
         channels = 'channels = { coil_current = "A" }\n'
         rubbed = f" - abs(coil_current)*(friction_per_ampere*sgn({qd}) + viscous_per_ampere*{qd})"
         width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
-    motor = drive.role != "force" or not _FROM_A_MOTOR.isdisjoint(words(drive.column))
+    stated = drive.role != "force" or not _FROM_A_MOTOR.isdisjoint(words(drive.column))
+    bench = drive.coil or not _ON_A_BENCH.isdisjoint(words(position))
+    # Most axes whose log names neither are driven, and the effects of drives are then candidates.
+    motor = stated or not (bench or not _FROM_A_SENSOR.isdisjoint(words(drive.column)))
     text = f'''# Proposed by `bampipe init`: one axis with inertia and friction
 schema = "bampipe.device/1"
 name = "{axis}"
