@@ -10,12 +10,11 @@ from bampipe.data.names import role_of
 from bampipe.data.readers import extension_of, hdf5, is_text, text
 from bampipe.data.readers.trial import NUMBER
 from bampipe.data.units import unit
+from bampipe.data.vocabulary import word_set
 
 _SMALL = 1 << 16
 """Bytes of what is written about logs, the most."""
-_NOTES = frozenset(
-    [".json", ".yaml", ".yml", ".toml", ".ini", ".cfg", ".txt", ".md", ".hdr", ".info", ".meta"]
-)
+_NOTES = word_set("notes")
 """File extensions of what is written about logs."""
 _STATEMENT = re.compile(
     r"(?P<name>[A-Za-z][\w .-]*?)\s*(?:[\[(](?P<of>[^\])\d]*)[\])])?"

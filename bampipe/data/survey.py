@@ -21,7 +21,7 @@ from bampipe.data.session.channels import CLOCK_UNITS
 from bampipe.data.session.file import lexically_inside
 from bampipe.data.stated_rate import intervals_stated, units_stated
 from bampipe.data.units import RecordedUnit, spelled, unit
-from bampipe.data.vocabulary import by_word, word_set
+from bampipe.data.vocabulary import VOCABULARY, by_word, word_set
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 
@@ -39,6 +39,8 @@ _WHOLE = 2
 """Of logs that hold both a motion and what drives it."""
 _RISES = 0.8
 """Share of samples at which a clock rises, if what else it does is an accident."""
+_AXES = word_set("axes")
+"""Words for the column that tells of which axis a row is."""
 _ASKED = word_set("asked")
 _TWINS = _ASKED | word_set("measured")
 """Words in the name of a file of what was asked for, and in that of the measurement beside it."""
@@ -155,7 +157,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
         for c in columns
     )
     if dataset is not None:
-        logs.remarks = [lerobot.REMARK]
+        logs.remarks = [VOCABULARY["remarks"]["lerobot"]]
     remarks, timed = (*logs.remarks, *guessed), any(c.role == "time" for c in columns)
     stated = {} if timed else intervals_stated(folder, {trial.file for trial in sound})
     return Survey(tuple(sound), columns, remarks, tuple(logs.passed), stated)
@@ -202,9 +204,7 @@ class _Logs:
                 where=str(folder),
                 remedy=self.passed[0][1]
                 if self.passed
-                else f"supported file extensions are {', '.join(readers.EXTENSIONS)}"
-                + "; of YAML, ros2 topic echo --csv makes a table"
-                * any(name.endswith((".yaml", ".yml")) for name in others),
+                else f"supported file extensions are {', '.join(readers.EXTENSIONS)}",
             )
         if len(paths) > MOST_FILES:
             raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
@@ -374,19 +374,18 @@ class _Logs:
     def _refuse_parted(self, first: str, reasons: Sequence[str]) -> None:
         """Refuse logs that have their positions in one file and what drives them in another."""
         roles = {n: {role_of(*column) for column in c.items()} for n, c in self.found.items()}
-        for here, there in (({"position"}, set(DRIVERS)), (set(DRIVERS), {"position"})):
-            if here & roles[first] and not (there | {"reference"}) & roles[first]:
-                other = next((name for name, other in roles.items() if there & other), "")
-                if other:
-                    why = next((f": {reason}" for reason in reasons if other in reason), "")
-                    raise InputError(
-                        f"positions and drives are in different files, such as {first} and {other}"
-                        f"{why}",
-                        where=str(self.folder),
-                        remedy="put the columns of one recording side by side in one file, the time"
-                        " once, and leave the parts out of this folder; or name the parts of each"
-                        " recording under [[trials.parts]] of a session.toml",
-                    )
+        there = set(DRIVERS) if "position" in roles[first] else {"position"}
+        parted = roles[first] & {"position", *DRIVERS} and not roles[first] & {*there, "reference"}
+        other = next((n for n, own in roles.items() if parted and there & own), "")
+        if other:
+            why = next((f": {reason}" for reason in reasons if other in reason), "")
+            raise InputError(
+                f"positions and drives are in different files, such as {first} and {other}{why}",
+                where=str(self.folder),
+                remedy="put the columns of one recording side by side in one file, the time"
+                " once, and leave the parts out of this folder; or name the parts of each"
+                " recording under [[trials.parts]] of a session.toml",
+            )
 
     def read(self, trial: TrialEntry, wanted: Sequence[str]) -> tuple[SurveyedColumn, ...]:
         """The columns of one recording."""
@@ -468,6 +467,16 @@ class _Logs:
         starts = starts_of(raw, column if times else "")
         if len(starts) == 1:
             return [trial]
+        wanted = {raw.first_row - 1, *(int(raw.rows[at]) for at in starts)}
+        with path.open(encoding="utf-8", errors="replace") as file:
+            lines = [re.split("[,;\t]", x.strip()) for n, x in enumerate(file, 1) if n in wanted]
+        for name, *axes in zip(*lines, strict=False):
+            if {*words(name)} <= _AXES and words(name) and len({*axes}) > 1:
+                raise InputError(
+                    f"recordings of several axes are in turn: {join_names(dict.fromkeys(axes), 4)}",
+                    where=f"{trial.file}, column '{name}'",
+                    remedy="write a file for each, as by frame.groupby of pandas, or a column",
+                )
         rows = ", ".join(str(raw.rows[at]) for at in starts[1:4])
         self.remarks.append(
             f"{trial.file} holds {len(starts)} recordings, which begin again at row {rows}"

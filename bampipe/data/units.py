@@ -1,6 +1,5 @@
 """Units that logs are written in, and what makes coherent SI units of them."""
 
-import math
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -8,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bampipe.data.vocabulary import by_word
+from bampipe.data.vocabulary import VOCABULARY, by_word
 
 
 @dataclass(frozen=True)
@@ -20,22 +19,14 @@ class RecordedUnit:
     offset: float = 0.0
 
 
-_TURN = 2 * math.pi
 _GRAVITY = 9.80665
-_POUND = 4.4482216152605
-_FACTORS: dict[str, tuple[str, float]] = {
-    **{si: (si, 1.0) for si in ("s", "m", "rad", "N", "A", "V", "W", "Hz", "Pa", "T", "K", "kg")},
-    "min": ("s", 60.0), "h": ("s", 3600.0), "g": ("kg", 1e-3), "%": ("", 1e-2), "‰": ("", 1e-3),
-    "deg": ("rad", math.pi / 180), "rev": ("rad", _TURN), "arcmin": ("rad", math.pi / 10_800),
-    "arcsec": ("rad", math.pi / 648_000), "in": ("m", 0.0254), "ft": ("m", 0.3048),
-    "gon": ("rad", math.pi / 200), "kgf": ("N", _GRAVITY), "gf": ("N", 1e-3 * _GRAVITY),
-    "kp": ("N", _GRAVITY), "lbf": ("N", _POUND),
-    "ozf": ("N", _POUND / 16), "kip": ("N", 1e3 * _POUND), "bar": ("Pa", 1e5),
-    "psi": ("Pa", _POUND / 0.0254**2),
-}  # fmt: skip
-"""Units that others are put together from, with their SI unit."""
 _ORDER = ("kg", "N", "W", "Pa", "V", "A", "T", "K", "Hz", "rad", "m", "s")
 """In which SI units stand in a product."""
+_FACTORS: dict[str, tuple[str, float]] = {
+    name: next(iter(of.items()))
+    for name, of in ({si: {si: 1.0} for si in _ORDER} | VOCABULARY["units"]).items()
+}
+"""Units that others are put together from, with their SI unit."""
 _LOGGED = frozenset(["", *_ORDER, "N.m", "rad/s", "rad/s2", "m/s", "m/s2"])
 """SI units of what is logged."""
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "da": 10.0, "k": 1e3, "M": 1e6}
@@ -45,7 +36,9 @@ _RATES = {"rpm": "rev/min", "r/min": "rev/min", "rps": "rev/s", "dps": "deg/s"}
 _SPELLINGS = by_word("unit_spellings")
 _PLAIN = str.maketrans("µμ×⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "uux-0123456789")
 _CELSIUS = frozenset(["degc", "°c", "c", "celsius"])
-_NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
+_NAME_WITH_UNIT = re.compile(
+    r"(?P<name>.*?)(?:\s*(?P<open>[\[(])\s*|\s/\s)(?P<unit>[^\[\]()]{1,16}?)\s*(?(open)[\])])\Z"
+)
 SCALES = ("scale", "scaling", "factor", "lsb", "gain")
 """What a file calls the number that readings are to be multiplied by, beside them."""
 _BESIDE = re.compile(r"(?i)(?:\A|(?<=[./]))units?[./]|(?:\A|[ _./])units?\Z")
@@ -77,7 +70,7 @@ def bare(text: str) -> str:
 
 
 def units_in(names: Iterable[str]) -> dict[str, str]:
-    """Units in names such as ``force [N]``; a number, as in ``q[0]`` or ``pos (1)``, is an index.
+    """Units in names such as ``force [N]`` or ``force / N``; a number, as in ``q[0]``, is an index.
 
     Beside units of other columns, ``[1]`` is one, unless the name comes with other numbers too.
     """
@@ -91,7 +84,8 @@ def units_in(names: Iterable[str]) -> dict[str, str]:
         alone = match["unit"] == "1" and others and numbered[match["name"]] == 1
         return bool(_INDEX.fullmatch(match["unit"])) and not alone
 
-    units = {n: m["unit"] for n, m in matches.items() if m["name"] and not is_index(m)}
+    matches = {n: m for n, m in matches.items() if m["name"] and (m["open"] or unit(m["unit"]))}
+    units = {n: m["unit"] for n, m in matches.items() if not is_index(m)}
     # Where all is in capitals, M and S are no names.
     return {n: u.lower() if n.isupper() and u in ("M", "S") else u for n, u in units.items()}
 

@@ -18,6 +18,7 @@ from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility, distance_from_prior
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
 from bampipe.setup.search import EXPLAINED, MOST_TRIALS, Finding, Search, shorten, spoilt_axes
+from bampipe.setup.sentences import sentence
 from bampipe.setup.turned_trials import find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -79,16 +80,13 @@ def inspect_setup(
     )
     axes = {axis: _axis(k, axis, held, mistakes) for k, axis in enumerate(system.coordinates)}
     warnings = [
-        f"{axis} hardly moves: it stands still in {100.0 * (1.0 - entry.moving_share):.0f} % of the"
-        " samples, so its parameters are poorly determined"
+        sentence("hardly_moves", axis=axis, still=100.0 * (1.0 - entry.moving_share))
         for axis, entry in axes.items()
         if entry.state == "hardly_moves"
     ]
     if held is not None and not mistakes and search.over_position is None:
         warnings += [
-            f"{axis}: the bare device explains {100.0 * max(1.0 - left, 0.0):.0f} % of how the"
-            " applied force varies, too little to check the meaning of the signals; do the logged"
-            " inputs drive this axis, and do they vary?"
+            sentence("unexplained", axis=axis, explained=100.0 * max(1.0 - left, 0.0))
             for (axis, entry), left in zip(axes.items(), held.left, strict=True)
             if entry.state == "unexplained"
         ]
@@ -98,17 +96,15 @@ def inspect_setup(
         warnings.append(robot.describe_mass(search.heavier.place, search.heavier.factor))
     if held is not None and search.over_position is not None:
         warnings += [
-            f"a torque that follows the position of {axis}, as by gravity or a spring, lowers its"
-            f" error from {_fall(i, held, search.over_position)}, but the device has none: add it"
-            " to [energy] potential of the device file, or let the diagnosis name it"
+            sentence("over_position", axis=axis, fall=_fall(i, held, search.over_position))
             for i, axis in enumerate(system.coordinates)
             if search.over_position.error[i] < held.error[i] / 1.5
         ]
     named = " ".join(mistake.sentence for mistake in mistakes)
     warnings += [
-        f"{sentence}: the scale of all estimates depends on it"
-        for sentence in placeholders
-        if sentence not in named
+        f"{said}: the scale of all estimates depends on it"
+        for said in placeholders
+        if said not in named
     ]
     return SetupResult(
         headline="; ".join(mistake.sentence for mistake in mistakes),
@@ -128,8 +124,8 @@ def _describe_travel(
         most, meant = _FARTHEST[coordinate.kind]
         axis = session.axes[coordinate.name]
         if size > most and axis.raw_unit == coordinate.unit and not axis.unit_in_log:
-            said = f"{coordinate.name} moves through {size:.3g} {coordinate.unit}"
-            yield f"{said}: is its position in {meant}?"
+            of = {"axis": coordinate.name, "size": size, "unit": coordinate.unit}
+            yield sentence("far_travel", **of, meant=meant)
 
 
 def _axis(
@@ -153,12 +149,12 @@ def _record(
     system: System, session: IngestResult, found: Finding, placeholders: Mapping[str, Sequence[str]]
 ) -> SetupMistake:
     correction, axes = found.correction, spoilt_axes(found)
-    sentence = describe_correction(correction, session)
+    said = describe_correction(correction, session)
     left = [s for s, names in placeholders.items() if set(correction.signals) <= set(names)]
     rivals = found.rivals
     if correction.kind == "scale" and left:
         size = _describe_factor(correction.factor, "small", "large")
-        sentence = f"{left[0]}, a placeholder: it makes the drive of the device about {size}"
+        said = f"{left[0]}, a placeholder: it makes the drive of the device about {size}"
         rivals = tuple(r for r in rivals if not set(r.signals) <= set(placeholders[left[0]]))
 
     def errors(of: Plausibility) -> dict[str, float]:
@@ -168,7 +164,7 @@ def _record(
         correction,
         gravity=correction.change.gravity,
         axes=tuple(system.coordinates[i] for i in axes),
-        sentence=sentence,
+        sentence=said,
         evidence=describe_evidence(system, axes, found.before, found.after),
         error_before=errors(found.before),
         error_after=errors(found.after),
@@ -190,13 +186,12 @@ def _record_turned(
         many = len(trials) > 1
         said = f"{' or '.join(map(join_names, any_of))} {'have' if len(any_of[0]) > 1 else 'has'}"
         its, entry, them = ("their", "entries", "them") if many else ("its", "entry", "the trial")
-        sentence = (
-            f"{join_names(names[k] for k in trials)}: {said} another sign than in the"
-            f" other trials: put negated = {json.dumps(any_of[0])} into {its} [[trials]] {entry},"
-            f" or leave {them} out"
-        )
+        whole = sentence(
+            "turned_trials", trials=join_names(names[k] for k in trials), said=said,
+            names=json.dumps(any_of[0]), its=its, entry=entry, them=them,
+        )  # fmt: skip
         record = _record(system, session, replace(odd[trials[0]], rivals=()), {})
-        yield record.model_copy(update={"sentence": sentence})
+        yield record.model_copy(update={"sentence": whole})
 
 
 def _require_scale(system: System, motions: Sequence[Motion]) -> None:
@@ -216,8 +211,7 @@ def _require_scale(system: System, motions: Sequence[Motion]) -> None:
             return
     names = join_names((system.parameters[i].name for i in free), _MANY)
     raise InputError(
-        f"the scale of its equation is undetermined: if {names} are all zero, no force is left to"
-        " explain",
+        sentence("no_scale", names=names),
         where=f"device {system.model.device.name!r}",
         remedy="make a known one a constant, such as the gain of the input",
     )
@@ -259,10 +253,7 @@ def describe_correction(correction: Correction, session: IngestResult) -> str:
         return f"{join_names(correction.signals)} are exchanged: exchange their columns"
     if correction.change.gravity is not None:
         shown = ", ".join(f"{v:.4g}" for v in correction.change.gravity)
-        return (
-            "gravity has another direction in the frame of the base: if the robot is mounted so,"
-            f" write gravity = [{shown}] into [robot] of the device file"
-        )
+        return sentence("other_gravity", shown=shown)
     describe = {"clock": _clock, "zero": _zero, "sign": _sign, "scale": _scale}[correction.kind]
     return describe(correction, session)
 
@@ -311,10 +302,7 @@ def _sign(correction: Correction, session: IngestResult) -> str:
     names = correction.signals
     if len(names) > 1:
         if names[0] in session.force.columns:
-            return (
-                f"{join_names(names)} all have the wrong sign, as if forces on the hand were taken"
-                f" for those of the hand: negate {_force_entry(session)}"
-            )
+            return sentence("all_signs", names=join_names(names), entry=_force_entry(session))
         return f"{join_names(names)} have the wrong sign: negate their columns"
     name = names[0]
     if name in session.axes:
@@ -375,7 +363,4 @@ def _zero(correction: Correction, session: IngestResult) -> str:
 
 def _clock(correction: Correction, session: IngestResult) -> str:
     how = _describe_factor(correction.factor, "fast", "slowly")
-    return (
-        f"the clock runs {how}: correct the unit of the time column, and sample_rate_hz, which"
-        f" would be {session.sample_rate_hz / correction.factor:.4g}"
-    )
+    return sentence("clock", how=how, rate=session.sample_rate_hz / correction.factor)

@@ -238,6 +238,12 @@ def test_the_sheet_with_most_rows_of_a_workbook_is_read(tmp_path):
     trial = read_trial(path, ("Time [s]", "Force [N]"))
     np.testing.assert_array_equal(trial.columns["Force [N]"], np.tile(F, 2))
     assert trial.begun == (len(T),)
+    beside = book.create_sheet("angle")
+    for row in (["Time [s]", "Angle [deg]"], *zip(map(float, T), range(len(T)), strict=True)):
+        beside.append(row)
+    book.save(path)
+    angle = read_trial(path, ("Time [s]", "Angle [deg]")).columns["Angle [deg]"]
+    np.testing.assert_array_equal(angle, [*range(len(T)), *range(len(T))])
     path.write_bytes(path.read_bytes()[:900])
     assert "not a sound workbook of Excel" in refused(path, ("Time [s]",))
 

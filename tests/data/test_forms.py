@@ -1,6 +1,7 @@
 """Logs that are no plain tables: read to the same numbers, or refused with what to do."""
 
 import json
+import tomllib
 from pathlib import Path
 
 import h5py
@@ -35,76 +36,17 @@ def lines(form: str, head: str = "") -> str:
     return head + "\n".join(rows) + "\n"
 
 
-PROPERTIES = (
-    "Name\tq\tName\tu\nType\tREAL64\tType\tINT16\nUnit\tdeg\tUnit\tNm\nOffset\t0\tOffset\t0\n\n"
-)
-FORMS = {
-    "pairs": lines("[info] t={t:.3f} q={q:.4f} u={u:.4f}", "Booting...\n"),
-    "pairs of Python": lines("{{'t': {t:.3f}, 'q': {q:.4f}, 'u': {u:.4f}}}"),
-    "unit cells": (lines("{t:.3f} s;{q:.4f}°;{u:.4f} Nm", "t;q;u\n"), ("t [s]", "q [°]", "u [Nm]")),
-    "units in quotes": (
-        lines('"{t:.3f} s","{q:.4f} deg","{u:.4f} Nm"', "t,q,u\n"), ("t [s]", "q [deg]", "u [Nm]")
-    ),
-    "named lists": (
-        lines("{t:.3f},\"['q', 'u']\",\"({q:.4f}, {u:.4f})\"", "t,name,x\n"), ("t", "x.q", "x.u")
-    ),
-    "a matrix of MATLAB": lines("{t:.3f} {q:.4f} {u:.4f};", "[t q u\n") + "];\n",
-    "arrays in cells": (lines("{t:.3f},[ {q:.4f}  {u:.4f}]", "t,x\n"), ("t", "x[0]", "x[1]")),
-    "typeset minus": lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n").replace("-", "\u2212"),
-    "Fortran": lines("{t:.6E} {q:.6E} {u:.6E}", "t q u\n").replace("E", "D"),
-    "rows with numbers": lines('"{n}" {t:.3f} {q:.4f} {u:.4f}', '"t" "q" "u"\n'),
-    "groups above names": (
-        lines("{t:.3f},{q:.4f},{t:.3f},{u:.4f}", "Arm,,Cell,\nt,x,t,x\n"),
-        ("Arm t", "Arm x", "Cell x"),
-    ),
-    "names in two lines": (
-        lines("{t:.3f},{q:.4f},{u:.4f}", "Run 1,,\nTime,Arm,\n,q,u\n"), ("Time", "q", "u")
-    ),
-    "names twice": (lines("{t:.3f},{q:.4f},{u:.4f}", "t,x,x\n"), ("t", "x (1)", "x (2)")),
-    "properties of channels": (
-        lines("{t:.3f}\t{q:.4f}\t{t:.3f}\t{u:.4f}", f"Scope\n\n{PROPERTIES}"),
-        ("Time (1)", "q", "u"),
-    ),
-    "properties with colons": lines(
-        "{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n,Type: a,Type: b\ns,Units: rad,Units: N*m\n"
-    ),
-    "keys once a line": (
-        lines(
-            "{t:.3f}\t{q:.4f}\t{u:.4f}",
-            "Interval=\t0.01 s\nChannelTitle=\tq\tu\nRange=\t10 V\t10 V\nUnitName=\tdeg\tNm\n",
-        ),
-        ("Time", "q", "u"),
-    ),
-    "a rule below names": (
-        lines("  {t:.3f}  {q:.4f}  {u:.4f}", "  time s   POS (ANAT)   u\n ------------------\n"),
-        ("time s", "POS (ANAT)", "u"),
-    ),
-    "apostrophes": lines("1'00{t:.3f};{q:.4f};{u:.4f}", "t;q;u\n"),
-    "line protocol": lines("arm,id=a t={t:.3f},q={q:.4f},u={u:.4f} 1790000000"),
-    "lines of XML": (
-        lines('<R><T>{t:.3f}</T><P A1="{q:.4f}"/><M A1="{u:.4f}"/></R>'), ("T", "P.A1", "M.A1")
-    ),
-    "an index of pandas": (
-        lines("{t:.3f},{q:.4f},{u:.4f},1", ",a,b,b\n,x,x,y\nt,,,\n"), ("t", "a x", "b x")
-    ),
-    "an index without a name": (lines("{t:.3f},{q:.4f},{u:.4f}", ",q,u\n"), ("time", "q", "u")),
-    "remarks among samples": lines("{t:.3f} {q:.4f} {u:.4f}", "# t q u\n# trial 1\n") + "# 2\n",
-    "a first row with holes": (
-        "t,q,u,note\n" + lines("{t:.3f},{q:.4f},{u:.4f},").replace("1.0000,", ",start", 1)
-    ),
-    "names of two lines in quotes": (
-        lines("{t:.3f},{q:.4f},{u:.4f}", '"t\r\n[s]",q,"u\n\n(Nm)"\n'), ("t [s]", "q", "u (Nm)")
-    ),
-    "a summary at the end": (
-        lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n") + "\n# 60 rows\nLargest,0.99,\nOverruns: 0\n"
-    ),
-}  # fmt: skip
+def text_of(form, head="", tail="", swap=("", ""), columns=("t", "q", "u")):
+    return (head + lines(form) + tail).replace(*swap), columns
+
+
+KNOWN_FORMS = tomllib.loads(Path(__file__).with_name("forms.toml").read_text(encoding="utf-8"))
+FORMS = {name: text_of(**known) for name, known in KNOWN_FORMS.items()}
 
 
 @pytest.mark.parametrize("name", FORMS)
 def test_texts_that_are_no_plain_tables(tmp_path: Path, name: str):
-    form = FORMS[name]
-    text, columns = form if isinstance(form, tuple) else (form, ("t", "q", "u"))
+    text, columns = FORMS[name]
     path = tmp_path / "a.txt"
     path.write_text(text)
     assert set(columns) <= set(columns_of(path))
@@ -125,7 +67,7 @@ def test_units_of_properties_are_heard(tmp_path: Path):
             FORMS["properties of channels"][0],
             {"Time (1)": "", "q": "deg", "Time (2)": "", "u": "Nm"},
         ),
-        (FORMS["properties with colons"], {"t": "s", "q": "rad", "u": "N*m"}),
+        (FORMS["properties with colons"][0], {"t": "s", "q": "rad", "u": "N*m"}),
         (rate, {"t": "s", "q": "°", "u": "Nm"}),
         (
             lines("{t:.3f};{t:.3f};{q:.4f}", "path;Root/t;Root/q\nunit;s;rad\ntrace_values;;\n"),
@@ -137,6 +79,7 @@ def test_units_of_properties_are_heard(tmp_path: Path):
         ),
         (below, {"mSec": "", "TORQUE": "FT-LBS", "A (B)": "DEG"}),
         (lines("{t:.3f},{q:.4f}", "t [s],q (6064h)\n"), {"t [s]": "s", "q (6064h)": ""}),
+        (lines("{t:.3f};{q:.4f}", "t / s;φ / X\n"), {"t / s": "s", "φ / X": ""}),
     ):
         path.write_text(text)
         assert columns_of(path) == units
@@ -426,6 +369,9 @@ def test_axes_in_turn_copies_and_whole_seconds(tmp_path):
     write(tmp_path / "a/a.csv", "t,id,q_rad,tau_Nm", np.repeat(t, 2), np.tile([1, 2], 900), *both)
     for name, values in {"position": both[0], "torque": both[1], "time": t}.items():
         write(tmp_path / f"c/{name}.txt", "", np.sort(values))
+    rows = "".join(f"{j},{a},{b},{b}\n" for j in ("hip", "knee") for a, b in zip(t, q, strict=True))
+    (tmp_path / "f").mkdir()
+    (tmp_path / "f/f.csv").write_text(f"joint,time_s,q_rad,tau_Nm\n{rows}")
     write(tmp_path / "e/e.csv", "t_s,q_rad,tau_Nm,volt", t, q, u, np.round(40 * q + 1, 3))
     values = np.rint(1e3 * np.column_stack([q, u]).ravel())
     write(tmp_path / "b/b.csv", "stamp,ID,value", np.repeat(t, 2), np.tile([385, 641], 900), values)
@@ -433,6 +379,7 @@ def test_axes_in_turn_copies_and_whole_seconds(tmp_path):
         ("a", "q_rad is of another axis in each row"),
         ("b", "value is of another axis or signal in each row; write a file for each"),
         ("c", "2 rows for each time in time"),
+        ("f", "column 'joint': recordings of several axes are in turn: hip and knee"),
     ):
         with pytest.raises(InputError, match=said):
             propose(tmp_path / name)

@@ -206,7 +206,7 @@ def test_duty_cycle_and_supply_make_a_motor(tmp_path):
     duty, supply = session["channels"]["duty"], session["channels"]["supply"]
     assert duty == {"column": "pwm_percent", "unit": "percent"}
     assert supply == {"column": "vbat", "unit": "V"}
-    assert any("torque_constant and resistance are not yours yet" in x for x in proposal.check)
+    assert any("your own torque_constant and resistance" in x for x in proposal.check)
     device = registry.device_from(tomllib.loads((tmp_path / "device.toml").read_text()))
     assert check_device(device) == [] and device.force_unit == ""
 
@@ -394,6 +394,26 @@ def test_of_two_joints_without_a_drawing_a_position_has_its_own_drive(tmp_path):
     assert session["force"]["columns"] == ["tau1"]
 
 
+def test_a_stage_has_an_axis_for_each_letter_with_a_drive_of_its_own(tmp_path):
+    log, names = stage_log(), ("X", "Y")
+    table = {"t_ms": log["ms"]}
+    for size, name in zip((1.0, 3.0), names, strict=True):
+        table |= {
+            f"{name}.pos [mm]": log["pos_mm"],
+            f"{name}.current [A]": size * log["load_cell_N"],
+        }
+    session, proposal = proposed_for(table, tmp_path)
+    device = registry.device_from(tomllib.loads(proposal.device))
+    assert proposal.fill_in == [] and check_device(device) == []
+    assert [c.name for c in device.coordinates] == [*device.friction] == ["x", "y"]
+    assert [session["encoders"][axis]["column"] for axis in "xy"] == ["X.pos [mm]", "Y.pos [mm]"]
+    assert session["channels"]["motor_current_y"] == {"column": "Y.current [A]", "unit": "A"}
+    prior = {p.name: p.prior for p in device.parameters}
+    assert prior["inertia_y"] == pytest.approx(3.0 * prior["inertia_x"], rel=0.05)
+    found = samples(tmp_path, tmp_path / "out", "a")
+    np.testing.assert_allclose(found["q_y"], 1e-3 * log["pos_mm"][: len(found)], atol=1e-9)
+
+
 def test_the_files_of_one_recording_are_joined(tmp_path):
     """One quantity a file, as matrices without names; rows that one file has more are left out."""
     log = joint_log(3, seconds=10.0)
@@ -477,6 +497,11 @@ def test_units_at_the_end_of_names_and_what_slides(tmp_path):
     assert "driven by a current" in proposal.device
     session, proposal = proposed_for(labelled("t,dist,w,forc"), tmp_path / "b")
     assert session["force"]["unit"] == "N" and "linear axis" in " ".join(proposal.check)
+    assert "linear axis" in " ".join(
+        proposed_for(labelled("t,lift.pos,w,force"), tmp_path / "d")[1].check
+    )
+    current = labelled("t,Pos.AngleValue,w,Pos.MotorCurrent")
+    assert "driven by a current" in proposed_for(current, tmp_path / "e")[1].device
     session, _ = proposed_for(labelled("timer,stage pos mm,w,push_gf"), tmp_path / "c")
     assert session["time"]["column"] == "timer" and session["force"]["unit"] == "gf"
 

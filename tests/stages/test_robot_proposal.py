@@ -178,6 +178,27 @@ def test_columns_with_the_names_of_joints_go_to_these_joints(tmp_path: Path) -> 
     assert proposal.fill_in == []
 
 
+def test_columns_called_as_the_joints_are_positions_and_files_tell_what_is_in_them(
+    tmp_path: Path,
+) -> None:
+    frame = write_log(tmp_path)
+    frame = frame.rename(
+        columns={"q1": "shoulder", "q2": "elbow", "tau1": "T1_Nm", "tau2": "F2_Nm"}
+    )
+    frame.drop(columns=["acc1", "acc2"]).to_parquet(tmp_path / "log.parquet")
+    positions, drives, _ = paired(tmp_path)
+    assert positions == {"shoulder": "shoulder", "elbow": "elbow"}
+    assert drives == {"shoulder": "T1_Nm", "elbow": "F2_Nm"}
+    other = tmp_path / "other"
+    other.mkdir()
+    (tmp_path / "arm.urdf").rename(other / "arm.urdf")
+    for name, columns in (("angles", ["shoulder", "elbow"]), ("torques", ["T1_Nm", "F2_Nm"])):
+        part = frame[["time_s", *columns]].set_axis(["time", "field.j1", "field.j2"], axis=1)
+        part.to_parquet(other / f"run_joint_{name}.parquet")
+    drives = {"shoulder": "joint_torques:field.j1", "elbow": "joint_torques:field.j2"}
+    assert paired(other)[1] == drives
+
+
 def test_numbers_without_names_may_count_joints_in_alphabetical_order(tmp_path: Path) -> None:
     record_logs(tmp_path / "log", 4, "ZYYX", style="indexed")
     positions, drives, proposal = paired(tmp_path / "log")

@@ -19,6 +19,7 @@ from types import ModuleType
 from bampipe.data.readers import arrays, bag, hdf5, mat, objects, parquet, tdms, text
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
 from bampipe.data.units import unit, units_in
+from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError, located
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
@@ -26,7 +27,7 @@ TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 SHEETS = (".xlsx", ".xlsm")
 """Of workbooks, whose first sheet with rows is read as a text."""
 _OBJECTS = (".json", ".jsonl", ".ndjson")
-_AGAIN, _UNPACK = "copy it again from the logger", "unpack it, or export it as CSV"
+_AGAIN = "copy it again from the logger"
 Reader = ModuleType | arrays.ArrayReader
 _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     (TEXTS, text, "", ""),
@@ -51,19 +52,8 @@ EXTENSIONS = tuple(_READERS)
 _HEAD = 1 << 10
 _MOST_UNPACKED, _LEAST_ROOM = 100, 2 << 30
 """Of the size of a file, and bytes, which it may take in memory while it is read, if it is free."""
-_KINDS = (
-    (b"PAR1", (".parquet",), "a Parquet file"),
-    (b"TDSm", (".tdms",), "a TDMS file"),
-    (b"#ROSBAG", (".bag",), "a ROS bag"),
-    (b"\x89MCAP0", (".mcap",), "an MCAP file"),
-    (b"SQLite format 3", (".db3",), "an SQLite file"),
-    (b"PK\x03\x04", (_UNPACK, ".npz", *SHEETS), "a zip archive or spreadsheet"),
-    (b"\x93NUMPY", (".npy",), "an array of NumPy"),
-    (b"\x1f\x8b", (_UNPACK, ".gz"), "a gzip archive"),
-    (b"version https://git-lfs", ("fetch the file: git lfs pull",), "a pointer of Git LFS"),
-    (b"MATLAB", (".mat",), "a MATLAB file"),
-    (hdf5.SIGNATURE, (*hdf5.ENDINGS, ".mat"), "an HDF5 file"),
-)
+_KINDS = [(kind["bytes"].encode("latin-1"), kind) for kind in VOCABULARY["first_bytes"]]
+"""Bytes that a kind of file begins with, and what it is."""
 
 
 def read_trial(
@@ -205,8 +195,9 @@ def _reader(path: Path) -> Reader:
         raise InputError("the file is empty")
     if head[512:520] == hdf5.SIGNATURE:  # behind a user block of MATLAB
         head = b"MATLAB"
-    for magic, right, words in _KINDS:
-        if head.startswith(magic) and not {extension, path.suffix.lower()} & set(right):
-            remedy = right[0] if right[0][:1] != "." else f"name it *{right[0]}"
-            raise InputError(f"this is {words}, not *{extension}", remedy=remedy)
+    for magic, kind in _KINDS:
+        right = kind["extensions"].split()
+        if head.startswith(magic) and not {extension, path.suffix.lower()} & {*right}:
+            remedy = kind.get("remedy", f"name it *{next(iter(right), '')}")
+            raise InputError(f"this is {kind['what']}, not *{extension}", remedy=remedy)
     return _READERS.get(extension, text)

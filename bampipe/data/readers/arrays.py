@@ -19,14 +19,14 @@ import numpy as np
 
 from bampipe.data.readers import moments, trial
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
-from bampipe.data.units import SCALES, in_steps, units_beside
+from bampipe.data.units import SCALES, in_steps, units_beside, units_in
+from bampipe.data.vocabulary import word_set
 from bampipe.errors import InputError, located
 from bampipe.lists import join_names
 
 LARGEST_WIDTH = 64
 _RUN = re.compile(
-    r"(?i)(.+?(?=\[)|(?:.*[./_])?(?:trial|run|rep|test|take|rec|recording|exp|experiment|measurement"
-    r"|messung|versuch|essai|episode|ep|demo|trajectory|traj|log)s?_?(?=\d))"
+    rf"(?i)(.+?(?=\[)|(?:.*[./_])?(?:{'|'.join(sorted(word_set('recordings')))})s?[ _]?(?=\d))"
     r"(?:\[([^\[\]:]+)\]|(\d+))[./_]([^\[\]]+)"
 )
 """Name of an array of one of several recordings in a file."""
@@ -204,6 +204,8 @@ def called_signals(labels: Iterable[str], texts: Mapping[str, str]) -> dict[str,
         owner, _, key = label.rpartition(".")
         if key.lower() in NAMES and owner.endswith("]"):
             names.setdefault(owner, re.sub(r"[^\w ./+-]|[\[\]]", "", text))
+        if key.lower() in NAMES and (said := units_in([text])):
+            units.setdefault(owner, said[text])
     several = Counter((owner.rpartition("[")[0], name) for owner, name in names.items())
     of_names = {names.get(owner, owner): unit for owner, unit in units.items()}
     far = {own[0]: u for x, u in of_names.items() if (own := namesakes(x, labels))}

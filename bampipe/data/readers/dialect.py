@@ -10,13 +10,14 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import islice, zip_longest
+from itertools import islice, pairwise, zip_longest
 
 import numpy as np
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER, Dialect, check_columns
 from bampipe.data.units import bare, in_steps, unit, units_in
+from bampipe.data.vocabulary import word_set
 from bampipe.errors import InputError
 
 HEAD = 1 << 16
@@ -35,8 +36,10 @@ _NO_ANGLE = re.compile(
     r"(?i)force|moment|torque|power|activation|excitation|fiber|length|[_.][tpv][xyz]\Z|\Atime\Z"
 )
 _NUMBERED = "column_"
-_NAME_KEYS = frozenset(
-    ["name", "names", "signal", "channel", "kanal", "signalname", "channeltitle", "path"]
+_NAME_KEYS = word_set("name_keys")
+_LISTED = re.compile(
+    r"(?i)\W*(?:name|column|channel|signal|ch|col|spalte|kanal)?[ _#]*(\d+)(?:[ _]?name)?\s*[:=)]"
+    r"\s*([^\W\d_].*)"
 )
 _SCALES = re.compile(r"(?i)scal(e|ing)[ _]?(factor)?|factor|faktor|skalierung|lsb")
 _SEARCHED = 200
@@ -132,7 +135,8 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     body = lines[index + 1 :]
     named = lines[max(index, 0)].text
     # Not the joint whose name was put in brackets.
-    units = {h: u for h, u in units_in(header).items() if dialect.names or u in named}
+    written = "\n".join(line.text for line in lines[: index + 1])
+    units = {h: u for h, u in units_in(header).items() if dialect.names or u in written}
     units |= _units_of_motion([line.text for line in lines[:index]], header)
     for line in lines[: max(index, 0)]:
         row = cells(line.text, delimiter)
@@ -282,6 +286,11 @@ def _header(
                 return index, below if fits else delimiter, row
     found = [(_above(lines, first, delimiter), delimiter) for first, delimiter in guesses]
     index, delimiter = next((each for each in found if each[0] >= 0), (-1, ""))
+    listed, row = _listed(lines[:at]), names(index, delimiter) if index >= 0 else []
+    unnamed = sum(bool(re.search(r"\w", name)) for name in row) < width
+    if unnamed and len(listed) == width > 1 and {*columns} <= {*listed}:
+        check_columns(listed, columns, "the list of columns")
+        return max(_filled(lines[:at])), mark, listed
     if index < 0:
         first, delimiter = guesses[0]
         row = [f"{_NUMBERED}{n}" for n, _ in enumerate(cells(lines[first].text, delimiter), 1)]
@@ -293,9 +302,15 @@ def _header(
             remedy=f"add a line {','.join(columns)}, or give names under [csv]; without names, the"
             f" columns are {row[0]} to {row[-1]}",
         )
-    row = names(index, delimiter)
     check_columns(row, columns, f"row {lines[index].number}")
     return index, delimiter, row
+
+
+def _listed(above: list[Line]) -> list[str]:
+    """Names of the columns where they are listed a line each above the samples, by number."""
+    found = [match for line in above if (match := _LISTED.match(line.text))]
+    in_order = {int(after[1]) - int(match[1]) for match, after in pairwise(found)} == {1}
+    return [match[2].strip() for match in found] if in_order else []
 
 
 def _filled(lines: list[Line]) -> list[int]:
@@ -477,9 +492,10 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
     wordy = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
     if wordy and wordy[-1] != fitting[-1]:
         return wordy[-1]  # what is below has numbers, and cells that are empty
-    if len(fitting) > 1 and _are_units(rows[fitting[-1]]) and len(rows[fitting[-2]]) == width:
-        return fitting[-2]
-    return fitting[-1] if fitting else -1
+    above_units = (
+        over for over, n in pairwise(fitting) if _are_units(rows[n]) and len(rows[over]) == width
+    )
+    return next(above_units, fitting[-1] if fitting else -1)
 
 
 def _says_more(row: list[str]) -> bool:

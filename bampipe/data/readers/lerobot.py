@@ -26,10 +26,6 @@ EPISODE = "episode_index"
 NO_READINGS = ("frame_index", EPISODE, "index", "task_index")
 """Columns with the number of a row, an episode or a task."""
 STATE = "observation.state"
-REMARK = (
-    "a data set of LeRobot, an episode a trial; it states no units: its servos count in degrees, or"
-    " from -100 to 100 over the range of a joint"
-)
 _LATEST_S = 1.0
 """Longest lag behind a goal that is looked for."""
 

@@ -15,7 +15,7 @@ _DAY = 86_400 * NANOSECONDS
 _MOMENT = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?\s*\Z")
 """ISO 8601 date and time."""
 _OF_DAY = re.compile(
-    r"\s*(?:\d+ days )?(?:\d{1,2}:\d\d:\d\d(?:[.,]\d+|:\d{3})?|\d{1,2}:\d\d[.,]\d+)\s*\Z"
+    r"\s*(?:\d+ days )?(?:\d{1,2}:\d\d:\d\d(?:[.,]\d+|[:;]\d{3})?|\d{1,2}:\d\d[.,]\d+)\s*\Z"
 )
 """Time of day, of a stop watch, and since the first sample, as pandas writes it."""
 _LOCAL = re.compile(
@@ -54,7 +54,7 @@ def nanoseconds(values: Sequence[str | None] | np.ndarray, form: str, row: int =
     if not form:
         plain = _iso_of_local(text).str.replace(",", ".")  # ISO 8601 takes either as decimal sign
         of_day = plain.str.match(_OF_DAY).fillna(False)
-        clock = plain.str.replace(r"^(\d\d?:\d\d:\d\d):", r"\1.", regex=True)
+        clock = plain.str.replace(r"^(\d\d?:\d\d:\d\d)[:;]", r"\1.", regex=True)
         clock = clock.str.replace(r"^(\d\d?:\d\d\.)", r"0:\1", regex=True)
         since = pd.to_timedelta(clock.where(of_day), errors="coerce")
         plain = plain.mask(of_day, (pd.Timestamp(0) + since).astype("string"))

@@ -33,10 +33,10 @@ _LABVIEW = re.compile(
     r"(?:LabVIEW|[A-Z]\w*_[A-Z]\w*|Separator|X_Columns|Operator|Project|Description|Date|Time|Channels"
     r"|Samples|X0|\*\*\*End_of_Header)"
 )
-MINUS_BEHIND = re.compile(r"((?<![^\s;,|\"])\d+[.,]?\d*-|(?<=[\t;,|])\(\d+[.,]\d+\))(?![^\s;,|\"])")
-PUT_BEFORE = "export with the minus before the number, not behind it and not as brackets"
+_BEHIND = re.compile(r"((?<![^\s;,|\"])\d+[.,]?\d*-|(?<=[\t;,|])\(\d+[.,]\d+\))(?![^\s;,|\"])")
 _GROUPS = ((",", r"\."), (".", ","), (" ", "[.,]"), ("'", "[.,]"), ("’", "[.,]"))
 """Signs between thousands, and what may stand before the decimals then."""
+_OF_MESSAGE = re.compile(r"( *)(?:- ?|(\w+): ?)(.*)")
 _BROKEN = re.compile(r'(?<![^\n,;\t])"[^",;\t\r\n]*(?:[\r\n]+[^",;\t\r\n]*){1,3}"(?![^\r\n,;\t])')
 _TYPESET = {"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2009": " "}
 """Minus and blanks of typesetters."""
@@ -69,8 +69,36 @@ _ALIKE = {
 
 
 def unbroken(text: str) -> str:
-    """The text without line ends in quoted names, as spreadsheets write them."""
+    """The text with a line a sample: no line ends in quoted names, as spreadsheets write them.
+
+    Messages as YAML with ``---`` between them, as ROS prints them, become a table.
+    """
+    messages = re.split(r"(?m)^---\s*$", text)
+    lines = messages[0].splitlines() if len(messages) > _FEWEST else []
+    if lines and all(map(_OF_MESSAGE.match, lines)):
+        rows = [*map(_by_path, messages)]
+        whole = [map(row.get, rows[0]) for row in rows if row.keys() == rows[0].keys()]
+        return "".join(f"{','.join(map(str, row))}\n" for row in (rows[0], *whole))
     return _BROKEN.sub(lambda name: re.sub(r"[\r\n]+", " ", name[0]), text)
+
+
+def _by_path(message: str) -> dict[str, str]:
+    """What a message as YAML holds by its path; of lists each item, by a list ``name`` if any."""
+    path, found = dict[int, str](), dict[str, list[str]]()
+    for match in filter(None, map(_OF_MESSAGE.match, message.splitlines())):
+        indent, key, said = match.groups()
+        if key:
+            path = {n: k for n, k in path.items() if n < len(indent)} | {len(indent): key}
+        items = said.strip("[] ").split(",") if said[:1] == "[" else [said] * bool(said)
+        found.setdefault(".".join(path.values()), []).extend(x.strip(" '\"") for x in items)
+    names = found.pop("name", [])
+    ends = {len(items): [f".{n}" for n in range(len(items))] for items in found.values()}
+    ends |= {1: [""], len(names): [f".{name}" for name in names]}
+    return {
+        name + end: item
+        for name, items in found.items()
+        for end, item in zip(ends[len(items)], items, strict=True)
+    }
 
 
 def find_form(head: str) -> Form | None:
@@ -102,9 +130,10 @@ def find_form(head: str) -> Form | None:
     for find in (_protocol_fields, _elements, _PAIR.findall):
         if pairs := _pairs(lines, find):
             return pairs
-    behind = [match[0] for line in lines if (match := MINUS_BEHIND.search(line))]
+    behind = [match[0] for line in lines if (match := _BEHIND.search(line))]
     if len(behind) > max(_FEWEST, (1.0 - _MOST) * len(lines)):
-        raise InputError(f"'{behind[0]}' may be a negative number", remedy=PUT_BEFORE)
+        remedy = "export with the minus before the number, not behind it and not as brackets"
+        raise InputError(f"'{behind[0]}' may be a negative number", remedy=remedy)
     for delimiter in (*_DELIMITERS, " "):
         table = [cells(line, delimiter) for line in (*whole[:_TRIED], *lines)]
         width = Counter(map(len, table)).most_common(1)[0][0]

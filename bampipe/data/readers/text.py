@@ -21,6 +21,7 @@ from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments, rewriting
 from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
 from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, need, opened
+from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError, located
 
 BLOCK = 1 << 20
@@ -144,6 +145,7 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
 def _sheet(file: BinaryIO) -> BinaryIO:
     """The sheets of a workbook that have the header of the longest, as CSV, one below the other.
 
+    Other columns of sheets with the same first column, as of times, stand beside these.
     InputError without openpyxl.
     """
     book = need("openpyxl", "xlsx").load_workbook(file, read_only=True, data_only=True)
@@ -153,7 +155,11 @@ def _sheet(file: BinaryIO) -> BinaryIO:
     text = io.StringIO(newline="")
     for rows in sheets if named else [longest]:
         if rows is longest or named[0] in rows:
-            csv.writer(text).writerows(rows)
+            alike = [x for x in sheets if named and [r[:1] for r in x] == [r[:1] for r in rows]]
+            at = rows.index(named[0]) if alike else 0
+            new = [(x, c) for x in alike for c, name in enumerate(x[at]) if name not in rows[at]]
+            wide = ([*row, *(x[n][c] for x, c in new)] for n, row in enumerate(rows))
+            csv.writer(text).writerows(wide)
     return io.BytesIO(text.getvalue().encode())
 
 
@@ -438,21 +444,12 @@ def _fault(message: str, layout: TableLayout, line: Line | None) -> InputError:
         return InputError(message)
     column, value = layout.header[int(cell[1])], cell[3]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
-    other = "," if layout.decimal == "." else "."
-    sign = re.fullmatch(rf"\s*[-+]?\d+{re.escape(other)}\d+\s*", value)
-    remedy = rewriting.PUT_BEFORE if rewriting.MINUS_BEHIND.search(f";{value}") else ""
-    if sign:
-        remedy = f"export with one decimal sign; '{layout.decimal}' was taken from the first rows"
-    elif re.fullmatch(r"\s*[-+]?\d{1,3}([ .,'’]\d{3})+([.,]\d*)?\s*", value):
-        remedy = "export without thousands separators"
-    elif moments.is_moment(value):
+    fitting = (r for r in VOCABULARY["no_numbers"] if re.fullmatch(r["cell"], value.strip()))
+    remedy = str(next(fitting, {"remedy": ""})["remedy"])
+    if moments.is_moment(value):
         remedy = 'is it the time? then say unit = "datetime" under [time]'
-    elif re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?\s+[^\d\s]\S*", value.strip(), re.IGNORECASE):
-        remedy = "export numbers without their units"
-    elif shown == value and re.fullmatch(r"[^\"\\]*[^\W\d][^\"\\]*", value.strip()):
-        remedy = f'if that means no reading, say missing = ["{value.strip()}"] under [csv]'
     return InputError(
         f"found '{shown}', expected a number",
         where=", ".join([*at, f"column '{column}'"]),
-        remedy=remedy,
+        remedy=remedy.format(cell=value.strip(), decimal=layout.decimal),
     )

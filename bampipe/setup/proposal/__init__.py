@@ -26,18 +26,17 @@ from bampipe.setup.mounting import Mounting
 from bampipe.setup.proposal import device as devices
 from bampipe.setup.proposal.device import DEVICE, UNKNOWN_CONSTANT, ChosenDevice, with_motors
 from bampipe.setup.proposal.matching import Matcher
-from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted, sentence
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import RobotColumns, find_robot_columns
 from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
+from bampipe.setup.sentences import sentence
 
 SESSION = "session.toml"
 _TRIALS = frozenset({"trial", "run", "condition", "test", "block", "versuch"})
 """Words in the name of a column that numbers trials."""
 _LEAP_S, _SHORTEST_S, _MOST_CUTS = 1.0, 2.0, 200
 """Length, s, of what lies between two trials and of a trial, the least; cuts, the most."""
-
-
 _GUESSED_GEAR = ", scale_sd = 0.1"
 """Of a reduction that weight shows beside bodies that are drawn to 15 %."""
 
@@ -113,8 +112,9 @@ def propose(
     passed: dict[str, list[str]] = {}
     for name, reason in found.passed:
         passed.setdefault(reason.removeprefix(name).lstrip(":, "), []).append(name)
+    identifier = re.sub(r"[^A-Za-z0-9._-]", "_", folder.resolve().name).lstrip("._-")
     lines = [
-        *_head(folder, chosen.name, clock.rate),
+        sentence("head", id=identifier or "session", device=quoted(chosen.name), rate=clock.rate),
         *(["[csv]", f"names = [{', '.join(map(quoted, names))}]", ""] if names else []),
         *("[time]", *clock.lines, ""),
         *encoders,
@@ -138,26 +138,8 @@ def _refuse_goals(folder: Path, found: Survey) -> None:
         return
     times = found.of("time")
     loops = lerobot.describe_loops(times[0].values, columns) if times else ""
-    known = f"; what can be: each servo's own loop follows its goal late ({loops})" * bool(loops)
-    raise InputError(
-        "no effort, current or load is recorded: what moved the joints is not known, so that"
-        f" inertia, weight and friction cannot be found{known}",
-        where=str(folder),
-        remedy="record the servos' current or load with the state; or identify a loop with its load"
-        " by a device file whose input is the goal: --device FILE",
-    )
-
-
-def _head(folder: Path, device: str, rate: str) -> list[str]:
-    sanitised = re.sub(r"[^A-Za-z0-9._-]", "_", folder.resolve().name).lstrip("._-")
-    return [
-        "# Proposed by `bampipe init`. Look at every line marked `guess` or `fill in`.",
-        'schema = "bampipe.session/1"',
-        f'session_id = "{sanitised or "session"}"',
-        f"device = {quoted(device)}",
-        rate,
-        "",
-    ]
+    what = sentence("goals_alone", known=sentence("loops", loops=loops) if loops else "")
+    raise InputError(what, where=str(folder), remedy=sentence("record_drive"))
 
 
 def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> ChosenDevice:

@@ -25,9 +25,9 @@ from bampipe.setup.hypotheses import MOST_TRAVEL
 from bampipe.setup.proposal import positions
 from bampipe.setup.proposal.joints import chain_logged
 from bampipe.setup.proposal.matching import Matcher
-from bampipe.setup.proposal.notes import sentence
 from bampipe.setup.proposal.positions import SLIDING, in_counts, is_velocity, needs_gain
-from bampipe.setup.proposal.starter import Drive, starter_device, weight_of
+from bampipe.setup.proposal.starter import Drive, stage_device, starter_device, weight_of
+from bampipe.setup.sentences import sentence
 
 DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"
@@ -111,12 +111,8 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
     except Branches as error:
         logged = chain_logged(error.chains, found)
         if not (logged or error.stem):
-            raise InputError(
-                error.what,
-                where=error.where,
-                remedy=f'write {DEVICE} beside the logs: name = "robot", and in [robot] urdf ='
-                f' "{urdfs[0].name}" and tip = "...", the last link of the logged joints',
-            ) from error
+            remedy = sentence("choose_tip", device=DEVICE, urdf=urdfs[0].name)
+            raise InputError(error.what, where=error.where, remedy=remedy) from error
         why = "the last joint with a column" if logged else "the joints branch behind it"
         text += f'tip = "{logged or error.stem}"  # guess: {why}\n'
         device = _complete(folder, text)
@@ -197,16 +193,14 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
     found, notes = match.found, match.notes
     position = match.position("")
     if position is None:
-        way = "say in order what they are: bampipe init FOLDER --names t,angle_deg,..."
-        if not is_text(found.trials[0].file):
-            way = "name them in the log for what they are, as t and angle_deg"
-        raise InputError(
-            "no column looks like a position",
-            where=f"{folder}: {found.trials[0].file}",
-            remedy=f"{way}; columns are {', '.join(c.name for c in found.columns[:12])}",
-        )
+        file, columns = found.trials[0].file, ", ".join(c.name for c in found.columns[:12])
+        way = sentence("say_names" if is_text(file) else "name_columns", columns=columns)
+        raise InputError("no column looks like a position", where=f"{folder}: {file}", remedy=way)
     linear = positions.slides(position, found)
     driver, role = match.driver(position)
+    stage = match.stage(position, driver) if driver is not None and linear else {}
+    if len(stage) > 1 and role != "duty":
+        return _stage(stage, role, match)
     supply = match.supply(driver) if role == "duty" else None
     coil = role == "force" and _has_coil(driver, match)
     read, position = (position, position) if linear else _at_joint(position, driver, match)
@@ -230,7 +224,7 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
     name = position.name.removesuffix(f" [{read.stated}]")
     text = starter_device(name, linear, drive, fit, weight, width)
     device = registry.device_from(tomllib.loads(text), DEVICE)
-    axis, placeholders = device.coordinates[0].name, list(device.constants)
+    axis = device.coordinates[0].name
     known = {axis: read, "supply": supply, device.forces[0]: driver}
     match.given = {name: column for name, column in known.items() if column is not None}
     on_motor = positions.is_of_motor(position) and not match.turning and not match.geared
@@ -244,12 +238,31 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
     notes.check.append(
         f"{DEVICE}: one {kind} axis '{axis}' driven by a {what}{doubt}; put in what you know of it"
     )
-    if placeholders:
-        are, them = ("are", "them") if len(placeholders) > 1 else ("is", "it")
-        said = f"{join_names(placeholders)} {are} not yours yet"
-        notes.check.append(f"{DEVICE}: {said}: all forces and inertias scale with {them}")
+    if names := join_names(device.constants):
+        notes.check.append(sentence("scales", device=DEVICE, names=names))
     if on_gravity:
         notes.check.append(f"{DEVICE}: on '{axis}', {on_gravity}")
+    return ChosenDevice(DEVICE, device, text)
+
+
+def _stage(
+    axes: Mapping[str, tuple[SurveyedColumn, SurveyedColumn]], role: str, match: Matcher
+) -> ChosenDevice:
+    """Propose a device file for a stage of sliding axes, by their positions and drives."""
+    texts = []
+    for name, (position, driver) in axes.items():
+        fit = _rough_fit(position, driver, role, True, match.t)
+        drive = Drive(role, driver.name, scaled=role == "force" and not needs_gain(driver))
+        width = 0.0 if in_counts(position) else _sign_width(position, match.t, True)
+        texts.append(starter_device("", True, drive, fit, sign_width=width, axis=name))
+    text = stage_device(texts)
+    device = registry.device_from(tomllib.loads(text), DEVICE)
+    for pair, source in zip(axes.items(), device.forces, strict=True):
+        match.given = {**match.given, pair[0]: pair[1][0], source: pair[1][1]}
+    match.rivals = []
+    match.notes.check.append(sentence("stage", device=DEVICE, axes=join_names(axes), role=role))
+    if names := join_names(device.constants):
+        match.notes.check.append(sentence("scales", device=DEVICE, names=names))
     return ChosenDevice(DEVICE, device, text)
 
 

@@ -55,6 +55,8 @@ def pair_joints(
     roles = ("current", "force") if device.force_unit == "A" else ("force", "current")
     drives = [group for role in roles for group in _groups(motors, found.of(role))]
     positions = _groups(joints, found.of("position"))
+    # A name of nothing but the joint is that of its position.
+    positions = positions or [group for group in _groups(joints, found.of("")) if group.named]
     some: dict[str, SurveyedColumn] = {}
     if not drives and positions:
         incomplete = [g for r in roles for g in _incomplete(motors, found.of(r), positions[0])]
@@ -157,7 +159,7 @@ def _numbered_alike(
 def _tokens(name: str, unit_of: str = "") -> Tokens:
     """Words and numbers of a name, in lower case, without a unit in brackets or at its end.
 
-    A force is called a torque, as that of a joint that slides is among others.
+    A force is called a torque, as that of a joint that slides is among others, F3 beside T1.
     """
     name = re.sub(rf"(?<=.)[_\W]+{re.escape(unit_of)}\Z", "", name) if unit_of else name
     bare = re.sub(
@@ -165,9 +167,9 @@ def _tokens(name: str, unit_of: str = "") -> Tokens:
         lambda said: " " if unit(said[1]) is not None or "°" in said[1] else f" {said[1]} ",
         name,
     )
+    bare = re.sub(r"(?i)(?<![a-z])[ft](?=\d)|force", "Torque", bare)
     parts = re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", bare)
-    lower = (str(int(p)) if p.isdigit() else p.lower() for p in parts)
-    return tuple("torque" if word == "force" else word for word in lower)
+    return tuple(str(int(p)) if p.isdigit() else p.lower() for p in parts)
 
 
 def _without(tokens: Tokens, part: Tokens) -> Tokens | None:

@@ -19,6 +19,7 @@ _SUPPLIED = frozenset(["in", "input", "supply", "bus", "battery", "d", "id"])
 """Words in the name of what a converter takes up, or of flux, rather than what turns a motor."""
 _NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
+_AXES = ("x", "y", "z")
 Match = tuple[SurveyedColumn | None, str]
 
 
@@ -98,33 +99,37 @@ class Matcher:
         clear = 1.0 - share[most.name] < guesses.CLEARLY * (1.0 - share[best.name])
         return most if clear and share[most.name] >= guesses.MOVED else best
 
-    def of_another(self, position: SurveyedColumn) -> dict[str, str]:
-        """Columns of another joint or trial, alike but for a number, by those of ``position``.
-
-        None unless what drives that position has such a number, too, or as many columns drive.
-        """
-        bare = ((c.name, re.sub(r"[\[(]\D*[\])]", "", c.name)) for c in self.found.columns)
-        split = {name: re.split(r"(\d+|\b[A-Z]\b)", said) for name, said in bare}
-        own = split[position.name]
-        alike = (split[name] for name in self.rivals if split[name][::2] == own[::2])
-        other = next((parts for parts in alike if parts != own), own)
-        known = [*self.used, *(c.name for c in self.given.values())]
-        pairs = {
-            name: called
-            for name in known
-            for called, parts in split.items()
-            if split[name][1::2] == own[1::2] != parts[1::2] == other[1::2]
-            and split[name][::2] == parts[::2]
+    def stage(
+        self, position: SurveyedColumn, driver: SurveyedColumn
+    ) -> dict[str, tuple[SurveyedColumn, SurveyedColumn]]:
+        """Position and drive of the axes x, y and z whose names are alike but for that letter."""
+        of: dict[tuple[str, ...], dict[str, SurveyedColumn]] = {}
+        for column in self.found.columns:
+            said = [word.removeprefix("f") or word for word in words(column.name)]
+            bare = [word for word in said if word not in _AXES]
+            if len(bare) + 1 == len(said) and not column.is_constant:
+                of.setdefault((column.role, *bare), {})[next(filter(_AXES.count, said))] = column
+        moved, driven = (
+            next((own for own in of.values() if c in own.values()), {}) for c in (position, driver)
+        )
+        return {
+            a: (moved[a], driven[a]) for a in _AXES if moved.keys() == driven.keys() and a in moved
         }
-        drives = [c for c in self.found.of(*DRIVERS) if not c.is_constant]
-        if any(c.name in pairs for c in drives):
-            return pairs
-        own_drive = next((c for c in drives if c.name in known), None)
-        likes = [c.name for c in drives if own_drive is not None and c.si == own_drive.si]
-        if own_drive is None or len(likes) != len(self.rivals):
-            return {}
-        place = 1 if position.name == self.rivals[0] else 0
-        return {position.name: self.rivals[place], own_drive.name: likes[place]}
+
+    def of_another(self, position: SurveyedColumn) -> dict[str, str]:
+        """Columns of another joint or trial, each by the one of its kind beside ``position``.
+
+        None unless as many columns drive as may be the position, or as may be for each drive.
+        """
+        known = {*self.used, *(c.name for c in self.given.values())}
+        moving = [c for c in self.found.columns if not c.is_constant]
+        pairs, driven = dict[str, str](), False
+        for column in (c for c in moving if c.name in known and position.name in self.rivals):
+            alike = [c.name for c in moving if (c.role, c.si) == (column.role, column.si)]
+            if 1 < len(alike) and len(self.rivals) % len(alike) == 0:
+                pairs[column.name] = alike[1 if column.name == alike[0] else 0]
+                driven |= column.role in DRIVERS
+        return pairs if driven and position.name in pairs else {}
 
     def _share(self, position: SurveyedColumn, column: SurveyedColumn) -> float:
         """The share of a column that the motion of a position explains, 0 if it is the position."""

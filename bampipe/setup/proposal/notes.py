@@ -1,21 +1,13 @@
 """The comments of a proposal, which are printed once more for its reader, and TOML values."""
 
 import json
-import tomllib
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from bampipe.lists import join_names
+from bampipe.setup.sentences import SENTENCES
 
 UNKNOWN = "?"
 """Stands for a column that could not be found."""
-_FILE = Path(__file__).with_name("sentences.toml")
-_SENTENCES = tomllib.loads(_FILE.read_text(encoding="utf-8"))
-
-
-def sentence(name: str, **known: object) -> str:
-    """A sentence of ``sentences.toml`` on what was guessed, with the fields in it."""
-    return str(_SENTENCES["said"][name].format(**known))
 
 
 @dataclass
@@ -56,7 +48,7 @@ class Notes:
             of: the item that the question concerns; a question about several is asked once.
             known: the other fields of its text.
         """
-        own = _SENTENCES[question]
+        own = SENTENCES[question]
         text, where = (own[part].format(of="{}", **known) for part in ("ask", "where"))
         self.fill_in.setdefault((text, where), []).append(of)
         return f"  # fill in: {text.replace('{}', of)}"

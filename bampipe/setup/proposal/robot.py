@@ -18,8 +18,9 @@ from bampipe.setup import drawn_bodies
 from bampipe.setup.drawn_bodies import Comparison, Drive, find_heavy, mean_left
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.proposal.joints import Group, pair_joints
-from bampipe.setup.proposal.notes import Notes, sentence
+from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import in_counts, position_in_si, scale_to
+from bampipe.setup.sentences import sentence
 
 BEYOND = 1.5
 """Times its range that a joint must travel for the position to be another's."""
@@ -354,30 +355,24 @@ def _sentences(
     if together:
         lines.append(sentence("all_turned"))
     for c, (name, drive) in zip(device.coordinates, drives.items(), strict=True):
-        column = columns[name].name
+        column, of = columns[name].name, {"joint": c.name}
         if not drive.is_sure:
-            said = [f"{column}: too little weight and inertia act on {c.name} to tell its sign"]
-            said += ["it is right"] if drive.is_dissipative else []
-            said += [f"it is turned, or that of {c.name} is the wrong one"] * drive.is_turned
-            lines += [] if together else ["; by its friction ".join(said)]
+            how = "unsure_turned" if drive.is_turned else "unsure_right"
+            friction = sentence(how, **of) if drive.is_turned or drive.is_dissipative else ""
+            said = sentence("unsure", column=column, by_friction=friction, **of)
+            lines += [] if together else [said]
             continue
         size, share = abs(drive.share), -drive.share if together else drive.share
-        said = []
-        if share < 0.0:
-            said.append(f"its sign is turned; or that of {c.name} is the wrong one")
+        why = [sentence("sign_turned", **of)] if share < 0.0 else []
         if device.force_unit == "A":
             agreed.append(f"{c.name} {1.0 / size:.3g} {c.torque_unit}/A")
-        elif size >= drawn_bodies.STATED[1]:
-            said.append("another unit, or bodies that are not drawn")
-        elif size <= drawn_bodies.STATED[0]:
-            said.append(
-                f"another unit, or the torque of a motor with a reduction of about {1.0 / size:.3g}"
-            )
-        elif not said:
+        elif not drawn_bodies.STATED[0] < size < drawn_bodies.STATED[1]:
+            why.append(sentence("small_drive" if size < 1.0 else "large_drive", reduction=1 / size))
+        elif not why:
             agreed.append(f"{c.name} {size:.2f}")
-        if said:
-            of = {"column": column, "share": share, "error": drive.error}
-            lines.append(sentence("drive_size", **of, why="; and ".join(said)))
+        if why:
+            known = {"column": column, "share": share, "error": drive.error}
+            lines.append(sentence("drive_size", **known, why="; and ".join(why)))
     if agreed:
         name = "constants" if device.force_unit == "A" else "agreed"
         lines.append(sentence(name, agreed=", ".join(agreed)))
@@ -385,5 +380,4 @@ def _sentences(
 
 
 def _explained(drives: Sequence[Drive]) -> str:
-    share = max(0.0, 1.0 - mean_left(drives))
-    return f"drawing, drives' inertia and friction explain {share:.1%} of the drives"
+    return sentence("explained", share=max(0.0, 1.0 - mean_left(drives)))

@@ -1,6 +1,8 @@
-"""A device file to start from: one axis with friction, driven by what was recorded."""
+"""A device file to start from: axes with friction, driven by what was recorded."""
 
 import re
+import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,25 +15,15 @@ from bampipe.data.vocabulary import word_set
 from bampipe.physics.device import KINDS
 from bampipe.physics.expression import FUNCTIONS
 from bampipe.setup.hypotheses import MOST_TRAVEL
-from bampipe.setup.proposal.notes import sentence
 from bampipe.setup.proposal.positions import in_counts
+from bampipe.setup.sentences import sentence
 
 _NAMELESS = word_set("nameless")
 _FROM_A_MOTOR, _FROM_A_SENSOR = REFERENCE_WORDS | word_set("driven"), word_set("sensed")
 _ON_A_BENCH = word_set("sliding")
-_DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
-_PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
 _FASTEST_S = 2e-4
 """Time in which viscous friction stops the least mass that a simulation is asked to follow, s."""
 _YIELDS = 2e-3
-_SOURCES = {
-    "torque_constant": (1.0, "N.m/A", "at the joint"),
-    "resistance": (1.0, "Ohm", "data sheet"),
-    "supply": (12.0, "V", "measured"),
-    "force_at_full": (1.0, "N", "measured"),
-}
-"""Constants that only their user knows: value to start from, unit, and where to look them up."""
-
 _ANGLES, _UPRIGHT = map(word_set, ("turning", "upright"))
 _LEAST_WEIGHT, _USUAL_GEAR = 1e-3, 10.0
 """Spread of a weight of which nothing shows, N.m; turns of a motor whose gear is not known."""
@@ -114,12 +106,14 @@ def starter_device(
     found: Driven,
     weight: Weight | None = None,
     sign_width: float = 0.0,
+    axis: str = "",
 ) -> str:
     """Write a device file of one axis, which the column of its position may name.
 
     Its constants are those that only its user knows.
 
     Args:
+        axis: its name, as one of several, behind which what belongs to it is called.
         found: sizes by a rough fit, SI, from which the priors are taken.
         weight: gravity on the axis, None where it carries none.
         sign_width: of the sign of the velocity, rad/s or m/s; 0 for the usual one.
@@ -129,11 +123,12 @@ def starter_device(
     parts = [item[1]] if item and unit_named(item[1]) is None else []
     names = [w for p in (*parts, position) for w in words(p) if w not in taken and len(w) > 2]
     names = [word for word in names if unit_named(word) is None]
-    axis = names[0] if names else ("carriage" if linear else "joint")
+    end = f"_{axis}" if axis else ""
+    axis = axis or next(iter(names), "carriage" if linear else "joint")
     kind, qd = ("linear" if linear else "rotary"), f"qd_{axis}"
     torque, mass = KINDS[kind][1], "kg" if linear else "kg.m2"
     rate = "N.s/m" if linear else "N.m.s/rad"
-    source, unit, applied, constants = _input_of(axis, linear, torque, drive)
+    source, unit, applied, constants = _input_of(axis, linear, torque, drive, end)
     channels = 'channels = { supply = "V" }\n' if drive.supply and not linear else ""
     rubbed, width = "", f"sign_width = {sign_width:g}  # guess: the encoder tells speeds as low\n"
     if drive.coil:
@@ -144,45 +139,22 @@ def starter_device(
     bench = drive.coil or not _ON_A_BENCH.isdisjoint(words(position))
     # Most axes whose log names neither are driven, and the effects of drives are then candidates.
     motor = stated or not (bench or not _FROM_A_SENSOR.isdisjoint(words(drive.column)))
-    text = f'''# Proposed by `bampipe init`: one axis with inertia and friction
-schema = "bampipe.device/1"
-name = "{axis}"
-summary = "One {kind} axis driven by a {drive.role}"
-source = "fill in"
-
-[coordinates.{axis}]
-kind = "{kind}"
-symbol = "{axis[0]}"
-{width if drive.coil or sign_width else ""}
-{_constants_table(constants)}[energy]
-kinetic = "inertia*ddt({axis})**2/2"
-potential = {_potential(axis, linear, weight)}
-
-[torque]                            # what is left at standstill
-{axis} = "-offset{rubbed}"
-
-[inputs]
-force = ["{source}"]{f"             # {drive.column}" if drive.column else ""}
-force_unit = "{unit}"
-{_DRIVE if motor else _PRESCRIBED if drive.coil else ""}{channels}
-[applied]
-{axis} = "{applied}"
-
-'''
-    if constants:
-        listed = " and ".join(constants)
-        text += f"# Guessed with {listed} as above: scale what follows with what you put in.\n"
+    listed, driven = " and ".join(constants), "driven" if motor else "prescribed"
     wide = 5.0 if drive.scaled else 100.0  # nobody knows yet what one of it is worth
     viscous, coulomb = (", ".join(_prior(size, wide)) for size in (found.viscous, found.coulomb))
-    text += f'''[friction.{axis}]
-viscous = {{ unit = "{rate}", {viscous}, lower = 0.0 }}  # guess
-coulomb = {{ unit = "{torque}", {coulomb}, lower = 0.0 }}  # guess
-'''
+    text = sentence(
+        "device", axis=axis, end=end, kind=kind, role=drive.role, symbol=axis[0], source=source,
+        sign_width=width if drive.coil or sign_width else "", constants=_constants_table(constants),
+        potential=_potential(axis, linear, weight, end), rubbed=rubbed, unit=unit, applied=applied,
+        column=f"             # {drive.column}" if drive.column else "", channels=channels,
+        drive=sentence(driven) if motor or drive.coil else "", rate=rate, torque=torque,
+        scaled=listed and sentence("scaled", constants=listed), viscous=viscous, coulomb=coulomb,
+    )  # fmt: skip
     least, spread = _least_inertia(linear, drive.coil, found), 0.6 * wide * abs(found.coulomb)
     inertia = (*_prior(found.inertia, wide), f"lower = {least:g}")
     offset = ("prior = 0.0", f"sd = {_rounded(spread or 20.0):g}")
-    text += _parameter("inertia", mass, inertia, "all that moves, reduced to this axis")
-    text += _parameter("offset", torque, offset, "needed to hold the axis where nothing else acts")
+    text += _parameter(f"inertia{end}", mass, inertia, "all that moves, reduced to this axis")
+    text += _parameter(f"offset{end}", torque, offset, sentence("offset"))
     if weight is not None:
         meaning = "mass times gravity times distance of the centre of gravity"
         for name, size in zip(("moment", "moment_across"), weight.moments, strict=True):
@@ -199,45 +171,55 @@ coulomb = {{ unit = "{torque}", {coulomb}, lower = 0.0 }}  # guess
 
 
 def _input_of(
-    axis: str, linear: bool, torque: str, drive: Drive
-) -> tuple[str, str, str, dict[str, tuple[float, str, str]]]:
+    axis: str, linear: bool, torque: str, drive: Drive, end: str
+) -> tuple[str, str, str, dict[str, str]]:
     """Name and unit of the input, what it does to the axis, and the constants in that."""
     if drive.role in ("current", "voltage"):
         si, per = ("A", "ampere") if drive.role == "current" else ("V", "volt")
-        gain = f"{'force' if linear else 'torque'}_per_{per}"
-        known = {gain: (1.0, f"{torque}/{si}", "data sheet, at the axis, gears included")}
-        return f"motor_{drive.role}", si, f"{gain}*motor_{drive.role}", known
+        gain = f"{'force' if linear else 'torque'}_per_{per}{end}"
+        known = {gain: sentence("gain", called=gain, unit=f"{torque}/{si}")}
+        return f"motor_{drive.role}{end}", si, f"{gain}*motor_{drive.role}{end}", known
     if drive.role == "duty":
         names = ["force_at_full"] if linear else ["torque_constant", "resistance"]
         names += [] if linear or drive.supply else ["supply"]
         applied = f"torque_constant/resistance*(duty*supply - torque_constant*qd_{axis})"
         applied = "force_at_full*duty" if linear else applied
-        return "duty", "", applied, {name: _SOURCES[name] for name in names}
-    return "force_drive", torque, "force_drive", {}
+        return "duty", "", applied, {name: sentence(name) for name in names}
+    source = f"force{end or '_drive'}"
+    return source, torque, source, {}
 
 
-def _constants_table(constants: dict[str, tuple[float, str, str]]) -> str:
+def stage_device(of_axes: Sequence[str]) -> str:
+    """Write one device file out of those of its axes, which do not act on one another."""
+    first, *others = of_axes
+    parsed = [tomllib.loads(text) for text in of_axes]
+    kinetic = " + ".join(one["energy"]["kinetic"] for one in parsed)
+    forces = ", ".join(f'"{name}"' for one in parsed for name in one["inputs"]["force"])
+    summary = f"Sliding axes, each {parsed[0]['summary'].partition('axis ')[2]}"
+    lines = {"name": '"stage"', "summary": f'"{summary}"', "kinetic": f'"{kinetic}"'}
+    for key, line in (lines | {"force": f"[{forces}]"}).items():
+        first = re.sub(rf"(?m)^{key} = .*", f"{key} = {line}", first, count=1)
+    for title, own in re.findall(r"(?m)^(\[.*\]).*\n((?:[^\[\n].*\n)*)", "\n".join(others)):
+        if title in ("[constants]", "[torque]", "[applied]"):
+            place = first.index("\n\n", first.index(title)) + 1
+            first = first[:place] + own + first[place:]
+        elif title not in ("[energy]", "[inputs]"):
+            first += f"\n{title}\n{own}"
+    return first
+
+
+def _constants_table(constants: dict[str, str]) -> str:
     if not constants:
         return ""
     sets = "they set" if len(constants) > 1 else "sets"
-    lines = [
-        f'{name} = {{ value = {value}, unit = "{unit}", source = "fill in: {where}" }}  # guess'
-        for name, (value, unit, where) in constants.items()
-    ]
     head = f"[constants]                         # {sets} the scale of all that is estimated"
-    return "\n".join([head, *lines, "", ""])
+    return "\n".join([head, *constants.values(), "", ""])
 
 
-def _potential(axis: str, linear: bool, weight: Weight | None) -> str:
+def _potential(axis: str, linear: bool, weight: Weight | None, end: str) -> str:
     if weight is None:
-        hint = f'gravity of a link: "-moment*cos({axis})", moment in N.m'
-        if linear:
-            hint = f'gravity where the axis rises: "9.81*inertia*{axis}"'
-        return f'"0"                     # {hint}'
-    doubt = weight.doubt or "the motion shows it"
-    without = 'of an upright axis "0", and without both tables [parameters.moment...]'
-    potential = f'"-moment*cos({axis}) + moment_across*sin({axis})"'
-    return f"{potential}  # guess: gravity; {doubt}; {without}"
+        return sentence("no_weight_slides" if linear else "no_weight_turns", axis=axis, end=end)
+    return sentence("weight", axis=axis, doubt=weight.doubt or "the motion shows it")
 
 
 def _least_inertia(linear: bool, coil: bool, found: Driven) -> float:

@@ -17,8 +17,9 @@ from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.matching import Match, Matcher
-from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted, sentence
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
+from bampipe.setup.sentences import sentence
 
 UNKNOWN_RATE = f'sample_rate_hz = "{UNKNOWN}"'
 _RECORDED = ":@time"
