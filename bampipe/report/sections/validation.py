@@ -209,7 +209,7 @@ def _draw_friction(
                     label="predicted without friction")  # fmt: skip
         bottom.axhline(0.0, color=style.INK, lw=0.5)
         top.set_title(style.break_heading(axis, len(axes)))
-        top.set_xlabel(style.label_axis("velocity", results.rate_unit(axis)))
+        top.set_xlabel(style.label_axis("velocity", f"{results.unit(axis)}/s"))
         bottom.set_xlabel("time (s)")
         quantity = style.label_axis(f"{kind} error", unit)
         if column == 0 or quantity != panels[0, 0].get_ylabel():
