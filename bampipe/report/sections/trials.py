@@ -73,9 +73,8 @@ def _describe_sampling(results: Results) -> str:
     text = f"{format_decimals(grid, 0)} Hz"
     if math.isfinite(rate) and abs(rate - grid) > _SAME_RATE * grid:
         text = f"{format_digits(rate)} Hz on average, put on a grid of {text} when filtered"
-    text = f"Sampled at {text}."
-    if session.kept_every > 1:
-        text = f"Logged at {format_digits(session.announced_rate_hz)} Hz, thinned. {text}"
+    thinned = f", thinned from {format_digits(session.announced_rate_hz)} Hz"
+    text = f"Sampled at {text}{thinned * (session.kept_every > 1)}."
     if noise := session.force.noise_sd:
         each = join_names(f"{name} {format_digits(sd, 2)}" for name, sd in noise.items())
         text += f" Noise of a sample: {each} {format_unit(session.force.unit)}."
