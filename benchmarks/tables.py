@@ -86,11 +86,10 @@ def write_kr300(result: Mapping[str, Any]) -> str:
         ["test, torque, %, bare", *(number(result["inverse_percent_bare"][a], 2) for a in axes)]
     )
     rows.append(["test, torque, %", *(number(result["inverse_percent"][a], 2) for a in axes)])
-    for steps, found in result["simulation"].items():
-        rows.append([f"{steps} steps", *(number(x, 2) for x in found["normalised_rmse"])])
-        rows.append(
-            [f"{steps} steps, velocity kept", *(number(x, 2) for x in found["velocity_kept"])]
-        )
+    steps, found = max(result["simulation"].items(), key=lambda one: int(one[0]))
+    simulated, kept = found["normalised_rmse"], found["velocity_kept"]
+    rows.append([f"{steps} steps", *(number(x, 2) for x in simulated)])
+    rows.append([f"{steps} steps, velocity kept", *(number(x, 2) for x in kept)])
     free, before, after = (
         result[key] for key in ("free_run", "inverse_percent_bare", "inverse_percent")
     )
@@ -104,14 +103,7 @@ def write_kr300(result: Mapping[str, Any]) -> str:
     worse = [axis for axis in axes if after[axis] > before[axis]]
     note = f" {result['note'].capitalize()}." if result["note"] else ""
     note += f" The effects raise the test's error on {', '.join(worse)}." if worse else ""
-    lost = [
-        f"{axis} ({steps} steps)"
-        for steps, found in result["simulation"].items()
-        for axis, *errors in zip(
-            axes, found["normalised_rmse"], found["velocity_kept"], strict=True
-        )
-        if errors[0] > errors[1]
-    ]
+    lost = [axis for axis, error, best in zip(axes, simulated, kept, strict=True) if error > best]
     note += f" Keeping the velocity is better on {', '.join(lost)}." if lost else ""
     added = ", ".join(f"`{e}`" for rung in result["choice"] for e in rung["added"])
     note += f" Chosen by validation, with {added}."
@@ -119,17 +111,17 @@ def write_kr300(result: Mapping[str, Any]) -> str:
 
 
 def write_measured_sets(result: Mapping[str, Any]) -> str:
-    """One row a set, with the values of its axes in order."""
-    rows = []
+    """One row a set, with the values of its axes in order; sets that did not run stand below."""
+    rows, refused = [], []
     for name, found in result.items():
         axes = [*found.get("axes", {}).values()]
-        done = bool(axes) and all(x["verdict"] for x in axes)
-        said = found["note"].replace("|", "/")
-        if done:
+        if not axes:
+            refused.append(f"{name} ({found['note']})")
+            continue
+        said = found["note"]
+        if done := all(x["verdict"] for x in axes):
             counts = Counter(map(_state_verdict, axes)).items()
-            said = ", ".join(
-                f"{n} × {verdict}" if len(axes) > 1 else verdict for verdict, n in counts
-            )
+            said = ", ".join(f"{n} × {each}" if len(axes) > 1 else each for each, n in counts)
         known = {effect: p for x in axes for effect, p in x["probabilities"].items()}
         added = [effect for _, effects in found.get("ladder", ()) for effect in effects]
         rows.append([
@@ -139,16 +131,10 @@ def write_measured_sets(result: Mapping[str, Any]) -> str:
             f"{found['seconds'] / 60.0:.1f}",
         ])  # fmt: skip
     head = [
-        "set",
-        "bare, %",
-        "after, %",
-        "regression, %",
-        "floor, %",
-        "verdict",
-        "added",
-        "CPU, min",
-    ]
-    return write_rows(head, rows)
+        "set", "bare, %", "after, %", "regression, %", "floor, %", "verdict", "added", "CPU, min"
+    ]  # fmt: skip
+    left = f"\n\nRefused until their user answers: {'; '.join(refused)}." if refused else ""
+    return write_rows(head, rows) + left
 
 
 def _list_errors(axes: Sequence[Mapping[str, Any]], which: str) -> str:
@@ -166,13 +152,13 @@ def _state_verdict(axis: Mapping[str, Any]) -> str:
 def write_rivals(
     result: Mapping[str, Any], emps: Mapping[str, Any], sets: Mapping[str, Any]
 ) -> str:
-    """What other programs reach, and what they are for; bampipe's own numbers come first."""
+    """What other programs reach; bampipe's own numbers come first."""
     loop = emps["rungs"][0]["open_loop_fitted_mm"]
     reached = f"EMPS, open loop, bare: {number(loop['test'])} mm (train {number(loop['train'])})"
     if arm := sets.get("staubli_tx40", {}).get("axes"):
         reached += f"; TX40, after: {_list_errors([*arm.values()], 'after')} %"
     mass, _ = emps["rungs"][0]["parameters"]["mass"]
-    rows = [["bampipe, as above", reached, number(mass), "", ""]]
+    rows = [["bampipe, as above", reached, number(mass), ""]]
     for name, x in result.items():
         reached = x["note"]
         if "open_loop_mm" in x:
@@ -181,7 +167,5 @@ def write_rivals(
         for what, errors in x.get("held_out_percent", {}).items():
             reached += f" TX40, {what}: {' '.join(f'{e:.1f}' for e in errors)} %;"
         mass = x.get("parameters", {}).get("mass")
-        rows.append([name, reached.strip(" ;"), number(mass), f"{x['seconds']:.0f}", x["scope"]])
-    return write_rows(
-        ["program", "error", "EMPS, mass, kg", "CPU, s", "in its makers' words"], rows
-    )
+        rows.append([name, reached.strip(" ;"), number(mass), f"{x['seconds']:.0f}"])
+    return write_rows(["program", "error", "EMPS, mass, kg", "CPU, s"], rows)
