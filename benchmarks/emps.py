@@ -231,7 +231,7 @@ def search(work: Path, session: Path, positions: dict[str, Array]) -> dict[str, 
     ladder = read_ladder(run)
     return {
         "seconds": seconds,
-        "told": told,
+        "told": told.replace(f"{work}/", ""),
         "effects": [effect for _, added in ladder for effect in added],
         "as_found": score(run, ladder[-1][0], positions),
         "diagnosis": read(run, "base", "diagnose")["axes"]["carriage"],

@@ -149,7 +149,7 @@ def measure(source: Path, write: WriteSession, folder: Path, most_s: float) -> d
         row["axes"] = describe(run, run_is_extended=True)
         row["ladder"] = [[model, added] for model, added in read_ladder(run)]
     except Failed as reason:
-        row["note"] = str(reason)
+        row["note"] = str(reason).removeprefix("bampipe: error: ").replace(f"{folder}/", "")
     return row | {"seconds": processor_seconds() - begin}
 
 

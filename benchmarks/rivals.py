@@ -31,16 +31,16 @@ ROOT = Path(__file__).resolve().parents[1]
 GIVEN, DT = 20, 1e-3
 SCOPE = {
     "mujoco": (
-        "“fits a 24-parameter model (armature, frictionloss, stiffness, damping for all 6 joints)"
-        " … by minimizing rollout tracking error” (README of its SO-101 example)"
+        "“fits a 24-parameter model … by minimizing rollout tracking error” (README of its SO-101"
+        " example)"
     ),
     "pysindy": (
         "“selecting relevant terms for the model from a library of candidate functions” (its"
         " documentation)"
     ),
     "figaroh": (
-        "“geometric calibration and dynamic parameter identification of rigid multi-body systems"
-        " described by a URDF” (its page on PyPI)"
+        "“geometric calibration and dynamic parameter identification of rigid multi-body systems”"
+        " (its page on PyPI)"
     ),
 }
 """What each is for, in its makers' words; naming what a model lacks is in none of them."""

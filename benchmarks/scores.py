@@ -10,11 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import beta, poisson
 
 from bampipe.diagnosis.criteria import Criteria, cap_probability
 
 TENTHS = np.linspace(0.0, 1.0, 11)
+MOST_ALARMS = 0.01
+"""Share of clean sessions that may be said to lack something."""
+BY_CHANCE = 0.01
+"""Probability below which as many wrong names as in a tenth are not put down to chance."""
 
 
 @dataclass(frozen=True)
@@ -60,46 +64,56 @@ class Scores:
         return max(self.unknown.values(), default=0.0) >= criteria.probability
 
 
-def write_tables(scores: Sequence[Scores], criteria: Criteria) -> str:
-    """Reliability, alarms and sets at the given criteria, as Markdown."""
+def write_tables(scores: Sequence[Scores], criteria: Criteria, *, by_set: bool = True) -> str:
+    """Reliability, alarms and, if asked, sets and time at the given criteria, as Markdown."""
     done = [s for s in scores if not s.failure]
     clean = [s for s in done if not s.effects and not s.outside]
     hidden = [s for s in done if s.effects and not s.outside]
     outside = [s for s in done if s.outside]
-    facts = [*_alarms(clean, criteria), *_sets(hidden, criteria)]
-    if outside:
+    table, facts = _reliability([*hidden, *outside], criteria)
+    facts += _alarms(clean, criteria)
+    if by_set:
+        facts += _sets(hidden, criteria)
+    if by_set and outside:
         facts.append(
             f"Sessions with an effect outside the library: {len(outside)}; something unknown is"
             f" said to be missing in {sum(s.finds_unknown(criteria) for s in outside)}."
         )
-    seconds = [s.seconds for s in done] or [np.nan]
-    took = f"{np.median(seconds):.1f} s of processor time, at most {max(seconds):.1f} s"
-    facts.append(f"A diagnosis took {took}.")
+    if by_set:
+        seconds = [s.seconds for s in done] or [np.nan]
+        took = f"{np.median(seconds):.1f} s of processor time, at most {max(seconds):.1f} s"
+        facts.append(f"A diagnosis took {took}.")
     return "\n".join(
         [
             f"{len(done)} sessions, {len(scores) - len(done)} refused; probability"
             f" {criteria.probability:g}",
             "",
-            *_reliability([*hidden, *outside], criteria),
+            *table,
             "",
             *(f"- {fact}" for fact in facts),
         ]
     )
 
 
-def _reliability(scores: Iterable[Scores], criteria: Criteria) -> list[str]:
-    """Of the effects given each tenth of probability, how many are there."""
+def _reliability(scores: Iterable[Scores], criteria: Criteria) -> tuple[list[str], list[str]]:
+    """Of the effects given each tenth of probability, how many are there; where too few are."""
     stated = [(p, e in s.effects) for s in scores for e, p in s.probabilities(criteria).items()]
-    lines = ["| stated probability | effects | mean stated | there | wrong |", "|-|-|-|-|-|"]
+    head = "| stated probability | effects | mean stated | there | wrong |"
+    lines, high_stated = [head, "|-|-|-|-|-|"], []
     for low, high in pairwise(TENTHS):
         here = [(p, t) for p, t in stated if low <= p < high or (high == 1.0 and p == 1.0)]
         if here:
-            true = sum(t for _, t in here)
+            wrong = sum(not t for _, t in here)
+            expected = sum(1.0 - p for p, _ in here)
             lines.append(
-                f"| {low:.1f} to {high:.1f} | {len(here)} | {np.mean([p for p, _ in here]):.3f} |"
-                f" {true / len(here):.3f} | {len(here) - true} |"
+                f"| {low:.1f} to {high:.1f} | {len(here)} | {1.0 - expected / len(here):.3f} |"
+                f" {1.0 - wrong / len(here):.3f} | {wrong} |"
             )
-    return lines
+            if poisson.sf(wrong - 1, expected) < BY_CHANCE:
+                high_stated.append(f"{low:.1f} to {high:.1f}")
+    where = " and ".join(high_stated)
+    said = f"More effects are wrong than stated, beyond chance (p < {BY_CHANCE:g}), at {where}."
+    return lines, [said] if high_stated else []
 
 
 def _alarms(clean: Sequence[Scores], criteria: Criteria) -> list[str]:
@@ -117,10 +131,11 @@ def _alarms(clean: Sequence[Scores], criteria: Criteria) -> list[str]:
         for p, s in zip(named, clean, strict=True)
     )
     bound = float(beta.ppf(0.95, sure + 1, len(clean) - sure)) if sure < len(clean) else 1.0
+    met = "met" if sure <= MOST_ALARMS * len(clean) else "not met"
     return [
         f"Of {len(clean)} clean sessions, {sure} are said to lack something (at most"
-        f" {100 * bound:.1f} % at 95 % confidence), {unsure} are left undecided, and"
-        f" {sum(bool(s.no_verdict) for s in clean)} have an axis without a verdict."
+        f" {100 * bound:.1f} % at 95 % confidence): the second target is {met}; {unsure} are left"
+        f" undecided, and {sum(bool(s.no_verdict) for s in clean)} have an axis without a verdict."
     ]
 
 

@@ -333,6 +333,8 @@ def write_table(content: Mapping[str, Any]) -> str:
     for row in content["rows"]:
         title, _, kind = row["title"].partition(": ")
         place = ("CPU", "memory").index(kind) + 1 if kind in ("CPU", "memory") else 0
+        if f"{title}: in all" in lines and place:
+            title += ": in all"
         line = lines.setdefault(title if place else row["title"], ["", "", ""])
         line[place] = _number(row["this"]) + ("" if place else f" {row['unit']}")
     table = [f"| | {here} | CPU, s | memory, MB |", "|-|-|-|-|"]

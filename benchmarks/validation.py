@@ -47,7 +47,7 @@ def write_calibration(path: Path) -> str:
         f"Of the {len(stated)} effects stated with a probability of {criteria.probability:g} or"
         f" more, {sum(stated)} exist: the first target is {met}."
     )
-    return f"{head}\n\n{write_tables(scores, criteria)}"
+    return f"{head}\n\n{write_tables(scores, criteria, by_set=False)}"
 
 
 def write_mistakes(path: Path) -> str:
@@ -61,6 +61,13 @@ def write_mistakes(path: Path) -> str:
 def write_speed(path: Path) -> str:
     """Times, memory and size, beside those of another commit."""
     return speed.write_table(json.loads(path.read_text(encoding="utf-8")))
+
+
+def write_rivals(path: Path) -> str:
+    """What other programs reach, beside what bampipe does on the same records."""
+    files = (path, RESULTS / "emps.json", RESULTS / "measured_sets.json")
+    stored = (json.loads(file.read_text(encoding="utf-8")) for file in files)
+    return tables.write_rivals(*(content["result"] for content in stored))
 
 
 def _stored(write: Callable[[Any], str]) -> Callable[[Path], str]:
@@ -77,7 +84,7 @@ TABLES: dict[str, tuple[str, str, Callable[[Path], str]]] = {
     "emps": ("emps", "emps.json", _stored(tables.write_emps)),
     "kr300": ("kr300", "kr300.json", _stored(tables.write_kr300)),
     "measured_sets": ("measured_sets", "measured_sets.json", _stored(tables.write_measured_sets)),
-    "rivals": ("rivals", "rivals.json", _stored(tables.write_rivals)),
+    "rivals": ("rivals", "rivals.json", write_rivals),
 }
 """By the name of a block: result in `measured.json`, what is stored, and what writes it."""
 
@@ -88,7 +95,8 @@ def read_measured() -> dict[str, dict[str, str]]:
     for path in sorted(RESULTS.glob("*.json")):
         held = json.loads(path.read_text(encoding="utf-8"))
         if path.stem in TABLES and "versions" in held and path.stem not in found:
-            versions = ", ".join(f"{name} {number}" for name, number in held["versions"].items())
+            numbers = held["versions"].items()
+            versions = ", ".join(f"{name} {one}" for name, one in numbers if name != "bampipe")
             found[path.stem] = {
                 "command": held["command"],
                 "commit": f"{held['commit']}; {versions}",

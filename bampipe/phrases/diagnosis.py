@@ -94,7 +94,8 @@ def split_alternatives(
     for names, chance in sets if len(sets) > 1 else ():
         marks = {name: mark * (name != UNKNOWN) for name in names if name not in common}
         rest = [f"{around}{name}{around}" for name, around in marks.items()]
-        shown = " with ".join(rest) or ("nothing more" if common else "nothing")
+        shown = " with ".join(filter(None, (*rest[:1], join_names(rest[1:]))))
+        shown = shown or ("nothing more" if common else "nothing")
         parts.append(f"{shown} ({probability(chance)})")
     if not parts:
         # In doubt together, since something unknown may resemble them: no alternatives.
@@ -204,7 +205,7 @@ def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> 
     if entry.verdict == "nothing_missing":
         return f"nothing of a size that matters is missing, as far as these trials show; {errors}"
     if entry.verdict == "unknown_effect":
-        listed = list_effects(entry, entry.probabilities)
+        listed = list_effects(entry, entry.likely)
         doubt = f"; in doubt beside it: {listed}" if listed else ""
         return f"something is missing that {_describe_unknown(entry, result)}{doubt}; {errors}"
     if entry.verdict == "missing":

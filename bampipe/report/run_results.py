@@ -98,10 +98,6 @@ class Results:
         """Return the unit of the position of ``axis``."""
         return self.session.axes[axis].unit
 
-    def rate_unit(self, axis: str) -> str:
-        """Return the unit of the velocity of ``axis``."""
-        return f"{self.unit(axis)}/s"
-
     def force_unit(self, axis: str) -> str:
         """Return the unit of the generalised force of ``axis``."""
         return "N.m" if self.is_rotary(axis) else "N"

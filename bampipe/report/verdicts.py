@@ -25,10 +25,8 @@ def describe_held_out(validated: ValidateResult) -> str:
         if len({name.partition("@")[0] for name in names}) == 1:
             return "each part of the trial predicted with the estimate from its other parts"
         return "each trial predicted with the estimate from the others"
-    which = f"trial{'s' * (len(names) > 1)} {join_names(names)}"
-    if len(names) > _MOST_NAMED:
-        which = f"{len(names)} of the {len(validated.trials)} trials"
-    return f"{which}, which no parameter has seen"
+    word = "trials" if len(names) > 1 else "trial"
+    return f"{word} {join_names(names, _MOST_NAMED)}, which no parameter has seen"
 
 
 def judge_session(results: Results) -> Callout:

@@ -45,7 +45,7 @@ class AxisVerdict(Record):
     @property
     def likely(self) -> list[str]:
         """The effects that may be missing, the most probable first."""
-        return sorted(self.probabilities, key=lambda name: -self.probabilities[name])
+        return sorted(self.probabilities, key=lambda name: (-self.probabilities[name], name))
 
 
 class RankedEffect(Record):
@@ -164,7 +164,7 @@ class DiagnoseResult(Result, file="models/{model}/diagnose.json", stage="diagnos
         axis_of = {each.effect: each.axis for each in self.ranking}
         open_question = entry.standing == "above_floor" and not entry.remains
         for one in self.sets:
-            here = tuple(name for name in entry.probabilities if name in one.effects)
+            here = tuple(name for name in entry.likely if name in one.effects)
             here = here or tuple(name for name in one.effects if axis_of.get(name) == axis)
             here += (UNKNOWN,) * (open_question and one.unknown == axis)
             found[here] = found.get(here, 0.0) + one.probability

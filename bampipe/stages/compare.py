@@ -81,8 +81,8 @@ def _find_moved(
             if abs(change) > sigmas * sd:
                 sentence = (
                     f"{name} moved from {round_with_sd(old.estimate, old.sd)} to"
-                    f" {round_with_sd(new.estimate, new.sd)} {new.unit}: without the effect it"
-                    " was biased."
+                    f" {round_with_sd(new.estimate, new.sd)} {new.unit}: without what was"
+                    " added it was biased."
                 )
                 of_model = {"parameter": name, "model": model, "parent": parent}
                 moved.append(Moved.of(new, **of_model, change=change, sd=sd, sentence=sentence))

@@ -236,9 +236,12 @@ def common(entries: Mapping[str, Sequence[Pair]]) -> dict[str, list[Pair]]:
 def write_summary(folder: Path = ENTRIES, without: Collection[str] = DETAILS) -> str:
     """How many sessions each stored entry answers, and all on those that all answer."""
     entries = read_entries(folder)
-    answered = ", ".join(f"{len(pairs)} by {name}" for name, pairs in entries.items())
-    head = f"Answered, of the {HIDDEN + CLEAN} sessions of the test part: {answered}."
-    head += " On those that all entries answer:"
+    answered, every = {name: len(pairs) for name, pairs in entries.items()}, HIDDEN + CLEAN
+    head = f"All entries answer the {every} sessions of the test part:"
+    if {*answered.values()} != {every}:
+        each = ", ".join(f"{count} by {name}" for name, count in answered.items())
+        head = f"Answered, of the {every} sessions of the test part: {each}."
+        head += " On those that all entries answer:"
     return f"{head}\n\n{write_table(common(entries), without)}"
 
 

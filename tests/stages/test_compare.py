@@ -87,7 +87,7 @@ def test_only_a_confirmed_model_shows_that_another_was_biased(tmp_path: Path, er
         add(tmp_path, name, parent, yaw=error if parent else 0.5)
         entry = {"estimate": mass, "sd": 0.1, "unit": "kg"}
         write_result(tmp_path, IdentifyResult, model=name, parameters={"mass": entry})
-    said = ["mass moved from 2.00 ± 0.10 to 3.00 ± 0.10 kg: without the effect it was biased."]
+    said = ["mass moved from 2.00 ± 0.10 to 3.00 ± 0.10 kg: without what was added it was biased."]
     assert [one.sentence for one in compared(tmp_path).moved] == (said if error < 0.5 else [])
 
 

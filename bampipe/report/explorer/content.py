@@ -242,7 +242,7 @@ def _add_recorded(sessions: Sequence[_Session], grids: _Grids) -> None:
     if motion is not None:
         rows = grids.start("motion", motion)
         for axis in rates:
-            about = {"label": f"velocity {axis}", "unit": format_unit(results.rate_unit(axis))}
+            about = {"label": f"velocity {axis}", "unit": format_unit(f"{results.unit(axis)}/s")}
             grids.add("motion", rows[f"qd_{axis}"], role="motion", **about)
 
 

@@ -55,6 +55,8 @@ def _show_model(
                 "Sets of effects, the most probable first",
                 "Effects | >Probability | >Log evidence over the first (nats)",
                 [(n, phrases.probability(s.probability), s.log_evidence - first) for n, s in sets],
+                "Probabilities are means over resampled blocks of time, so that no single event "
+                "decides: they differ less than the evidence of all blocks.",
             )
         yield phrases.null_distribution(found.chance)
     yield _advise(results, found) if lacking else _tell_sensitivity(results, model)
@@ -119,7 +121,8 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
         "held-out trials. Beyond bias: with the set, without the bias that filters leave where "
         "friction changes its sign. Floor: of replicates of the model with the set. Explainable: "
         "share of the present residual that a smooth function of motion and load predicts on "
-        "unseen trials. Errors and floors are of fits of the diagnosis, not those of Validation.",
+        "unseen trials. Errors and floors are of fits of the diagnosis, within the trials that it "
+        f"used ({join_names(found.trials, 4)}), not those of Validation.",
     )
 
 

@@ -211,6 +211,6 @@ def _tell_alternatives(results: Results, effect: str) -> str:
         row = next(row for row in diagnosis.ranking if row.effect == effect)
         others = row.indistinguishable_from[:_ALTERNATIVES]
         named = (f"`{n}` ({phrases.probability(known.get(n, 0.0))})" for n in others)
-        place = f"Alternatives: {join_names(named)}" if others else "No other effect is as likely"
+        place = f"Alternatives: {join_names(named)}" if others else "No other effect replaces it"
         return f"Its probability is {phrases.probability(known[effect])}. {place}."
     return "No diagnosis of this run has compared it with other effects."

@@ -59,7 +59,7 @@ def list_blocks(results: Results) -> Iterator[Block | None]:
     for axis, one in results.order_axes(identified.state_3sigma or {}).items():
         # The smoother before least squares gives no bound of position: no column of dashes.
         place = "" if one.position is None else format_scaled(one.position, results.unit(axis))
-        rows.append((axis, place, format_scaled(one.velocity, results.rate_unit(axis))))
+        rows.append((axis, place, format_scaled(one.velocity, f"{results.unit(axis)}/s")))
     caption = f"Error of the filtered state, 3σ bounds{results.cite_paper('Table VI')}"
     yield Table(caption, "Axis | >Position | >Velocity", rows).drop_empty_columns()
     trace = results.table(results.model_file("trace.parquet"))

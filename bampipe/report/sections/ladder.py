@@ -137,7 +137,8 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
         else:
             panel.set_ylim(0.0, 1.1 * both.max(initial=0.0) or 1.0)
         panel.set_xticks(x, _name_ticks(rungs[0].model, error))
-        panel.set(xlim=(-0.4, len(rungs) - 0.6), xlabel="version, and its error")
+        below = style.break_heading("version, and its error", len(axes))
+        panel.set(xlim=(-0.4, len(rungs) - 0.6), xlabel=below)
         panel.set(title=axis, ylabel=style.label_axis("RMSE", results.force_unit(axis)))
     parts = []
     for axis in axes:

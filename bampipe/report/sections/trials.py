@@ -4,6 +4,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from bampipe.lists import join_names
@@ -23,6 +24,7 @@ TITLE = "Data"
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 _BLANK = "\0"
 """Placeholder of a number in a remark."""
+_blank_numbers = partial(_NUMBER.sub, _BLANK)
 _LONG = 60
 """Length from which a remark shared by several trials is printed once, below the table."""
 _SAME_RATE = 0.02
@@ -71,7 +73,8 @@ def _describe_sampling(results: Results) -> str:
     text = f"{format_decimals(grid, 0)} Hz"
     if math.isfinite(rate) and abs(rate - grid) > _SAME_RATE * grid:
         text = f"{format_digits(rate)} Hz on average, put on a grid of {text} when filtered"
-    text = f"Sampled at {text}."
+    thinned = f", thinned from {format_digits(session.announced_rate_hz)} Hz"
+    text = f"Sampled at {text}{thinned * (session.kept_every > 1)}."
     if noise := session.force.noise_sd:
         each = join_names(f"{name} {format_digits(sd, 2)}" for name, sd in noise.items())
         text += f" Noise of a sample: {each} {format_unit(session.force.unit)}."
@@ -110,10 +113,6 @@ def _tabulate_trials(results: Results) -> Table:
     columns = "Trial | Kind | >Duration (s) | >Samples | State | Repairs, reason ~1"
     note = " ".join(_merge_remarks(remarks, pattern) for pattern in shared)
     return Table("Trials", columns, rows, note)
-
-
-def _blank_numbers(remark: str) -> str:
-    return _NUMBER.sub(_BLANK, remark)
 
 
 def _merge_remarks(remarks: Mapping[str, Sequence[str]], pattern: str) -> str:

@@ -28,8 +28,9 @@ def list_blocks(results: Results) -> Iterator[Block]:
             partner = None
             if bound.correlation is not None:
                 partner = f"`{bound.partner}` {format_decimals(bound.correlation, 2)}"
+            bias = found.least_squares_bias and round(found.least_squares_bias, 12)  # no 1e-19
             sds = (found.sd, bound.bound_sd, bound.alone_sd)
-            rows.append((name, *sds, partner, found.least_squares_bias, found.unit or "1"))
+            rows.append((name, *sds, partner, bias, found.unit or "1"))
         yield Table(
             "Standard deviation of each estimate beside the least possible",
             "Parameter :code | >SD :2 | >Bound :2 | >Alone :2 | Correlated with"

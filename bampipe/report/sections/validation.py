@@ -49,7 +49,8 @@ def list_blocks(results: Results) -> Iterator[Block]:
         f"forces are low-passed {each}.",
     )
     trials = []
-    for name, trial in validated.trials.items():
+    for name in sorted(validated.trials, key=lambda n: (n.partition("@")[0], len(n), n)):
+        trial = validated.trials[name]  # a part has its start in its name, as in log@10.0s
         key = "held_out_rmse" if trial.held_out else "rmse"
         # Zero: the axis rested, no sample counts.
         by_axis = (getattr(trial.axes.get(axis), key, None) or None for axis in results.axes)
@@ -63,7 +64,7 @@ def list_blocks(results: Results) -> Iterator[Block]:
             for name, one in validated.forces.items()
         )
         place = " at the handle" if results.pusher == "hand" else ""
-        yield f"Error of the predicted force{place} (RMSE): {shown}."
+        yield f"Error of the predicted force{place} (RMSE while all axes move): {shown}."
     if validated.free_run is not None and validated.free_run.drift:
         yield from _tabulate_drift(results, validated, validated.free_run.drift)
     yield validated.notes
@@ -209,7 +210,7 @@ def _draw_friction(
                     label="predicted without friction")  # fmt: skip
         bottom.axhline(0.0, color=style.INK, lw=0.5)
         top.set_title(style.break_heading(axis, len(axes)))
-        top.set_xlabel(style.label_axis("velocity", results.rate_unit(axis)))
+        top.set_xlabel(style.label_axis("velocity", f"{results.unit(axis)}/s"))
         bottom.set_xlabel("time (s)")
         quantity = style.label_axis(f"{kind} error", unit)
         if column == 0 or quantity != panels[0, 0].get_ylabel():

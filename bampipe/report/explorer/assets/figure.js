@@ -239,7 +239,7 @@ class Figure {
         y: { distr: options.logY ? 3 : 1, range: (_, min, max) => this.yRange(min, max) },
       },
       axes: [
-        axis("x", options.xLabel, { size: (_, texts) => 12 + 14 * Math.max(1, ...(texts ?? []).map((text) => String(text ?? "").split("\n").length)), space: 60, ...ticks }),
+        axis("x", options.xLabel, { size: (_, texts) => 9 + 17 * Math.max(1, ...(texts ?? []).map((text) => String(text ?? "").split("\n").length)), space: 60, ...ticks }),
         axis("y", options.yLabel, { size: (_, texts) => options.yWidth ?? 14 + 6.5 * Math.max(3, ...(texts ?? []).map((text) => String(text ?? "").length)), space: 26 }),
       ],
       series: [

@@ -44,7 +44,7 @@ class ResidualMap {
     const percent = Math.round(100 * share);
     this.figure = new Figure(host, {
       title: `residual ${axis} by ${variable}`,
-      xLabel: unit ? `${variable} (${unit})` : variable,
+      xLabel: unit ? `${variable} (${unit})` : variable === "trial" ? "trial, from 0" : variable,
       yLabel: axisOf(axis).unit,
       height: 210,
       rectangle: true,
