@@ -241,7 +241,10 @@ def _list_open_questions(diagnosis: DiagnoseResult) -> Iterator[str]:
 def _add(
     options: LoopOptions, model: str, effects: tuple[str, ...], tell: Callable[[str], None]
 ) -> str:
-    """Extend ``model`` by the effects with a strength; return "" if it does not improve."""
+    """Extend ``model`` by the effects with a strength; return "" if it does not improve.
+
+    If it does not, effects on axes whose own error falls are tried without the others.
+    """
     tell(f"adding {', '.join(effects)}")
     child = extend(options, model, effects)
     run = RunFolder(options.request.root)
@@ -260,4 +263,7 @@ def _add(
     if ladder[child].has_lost_its_floor(ladder[model]):
         why = "there is no noise floor, or the error is implausibly far below it"
     tell(f"{', '.join(effects)}: {why}, stopped at {model}")
-    return ""
+    axis_of = {row.effect: row.axis for row in run.read(DiagnoseResult, model).ranking}
+    worse = ladder[child].axes_worse_than(ladder[model])
+    helpful = tuple(effect for effect in effects if axis_of.get(effect) not in worse)
+    return _add(options, model, helpful, tell) if 0 < len(helpful) < len(effects) else ""

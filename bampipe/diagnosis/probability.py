@@ -135,10 +135,12 @@ def weigh_sets(
         with_unknown = _compute_probabilities([*named, *beside], seed)
         here_too = _sum_by_effect(with_unknown)
         unknown[axis] = sum(s.probability for s in with_unknown if s.unknown is not None)
-        for effect in acting:
-            effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
-            if unknown[axis] >= criteria.probability:
-                drops[effect] = _find_evidence_losses(with_unknown).get(effect, 0.0)
+        for effect in effects:
+            if axis in acting_axes(bare, effect):
+                effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
+        if unknown[axis] >= criteria.probability:
+            losses = _find_evidence_losses(with_unknown)
+            drops |= {effect: losses.get(effect, 0.0) for effect in acting}
         if unknown[axis] == unknown.max():
             sets = with_unknown
     excess = compute_excess(costs)

@@ -393,6 +393,12 @@ class Fit:
             return self.problem.solve_nuisance(len(self.linearisation.free))
         return self.problem.solve()
 
+    @property
+    def has_settled(self) -> bool:
+        """Whether another step promises no fall of the negative log likelihood that matters."""
+        here = self.problem.solve_nuisance(len(self.linearisation.free))
+        return here.cost - self.problem.solve().cost < _CONVERGED
+
     @cached_property
     def bias(self) -> tuple[Array, ...]:
         """The fitted bias, common and stopping, by axis, each (n,)."""

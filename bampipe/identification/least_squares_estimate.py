@@ -309,10 +309,11 @@ def fit_squares(
 
 
 def _with_values(fit: Fit, trials: MeasuredTrials, problem: Problem, block_s: float) -> SquaresFit:
-    """Return the fit with its parameters, including the last step of its linear problem."""
-    change = (fit.problem.to_parameters @ fit.solution.base)[: problem.free.size]
+    """Return the fit with its parameters, and the last step of its linear problem if that holds."""
     p = np.append(fit.linearisation.p, 0.0)
-    p[problem.free] = np.clip(p[problem.free] + change, problem.lower, problem.upper)
+    if problem.linear or fit.has_settled:
+        change = (fit.problem.to_parameters @ fit.solution.base)[: problem.free.size]
+        p[problem.free] = np.clip(p[problem.free] + change, problem.lower, problem.upper)
     return SquaresFit(fit, trials, problem, True, p, block_s)
 
 

@@ -94,7 +94,7 @@ def _assemble_equations(d: Vocabulary) -> Equations:
         kinetic=kinetic, potential=potential,
         dependence=_find_dependence(d, residual, [*rates, *terms.offset], motion.steps),
         compensation=_find_compensation(d, potential, acting),
-        delays=_find_delays(d, acting.applied),
+        delays=_find_delays(d, [*acting.applied, *rates]),
     )  # fmt: skip
 
 

@@ -53,6 +53,10 @@ class Rung(Record):
         ratios = (self.held_out_rmse[a] / max(e, 1e-300) for a, e in other.held_out_rmse.items())
         return math.prod(ratios) < 1.0 - NOTICEABLE
 
+    def axes_worse_than(self, other: Self) -> set[str]:
+        """Return the axes with a higher held-out error."""
+        return {a for a, e in other.held_out_rmse.items() if self.held_out_rmse[a] > e}
+
     def has_lost_its_floor(self, other: Self) -> bool:
         """Whether its error has no floor on an axis where that of ``other`` has one."""
         axes = other.noise_floor

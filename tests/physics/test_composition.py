@@ -328,17 +328,19 @@ strength = true
 
 
 @pytest.mark.parametrize(
-    ("effects", "delays"),
+    ("device", "effects", "delays"),
     [
-        ((), ()),
-        (("force_gain:x", "force_drift:y", "transmission_compliance:yaw"), ()),
-        (("stribeck:yaw", "force_delay"), ("force_delay.delay",)),
-        (("late_push:z",), ("late_push.z.lead",)),
+        ("bam", (), ()),
+        ("bam", ("force_gain:x", "force_drift:y", "transmission_compliance:yaw"), ()),
+        ("bam", ("stribeck:yaw", "force_delay"), ("force_delay.delay",)),
+        ("bam", ("late_push:z",), ("late_push.z.lead",)),
+        # Behind a lag, the force is a state, which the delay reaches by its rate.
+        ("slider", ("actuator_delay", "actuator_lag:motor"), ("actuator_delay.delay",)),
     ],
 )
 def test_delays_are_told_from_what_they_do(
-    effects: tuple[str, ...], delays: tuple[str, ...]
+    device: str, effects: tuple[str, ...], delays: tuple[str, ...]
 ) -> None:
     own = registry.effect_from(tomllib.loads(OWN), "late_push.toml")
-    system = compile_model(Model(registry.device("bam"), effects, (own,)))
+    system = compile_model(Model(registry.device(device), effects, (own,)))
     assert system.delays == delays
