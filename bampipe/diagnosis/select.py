@@ -38,7 +38,8 @@ model linearised far from the truth leaves a larger residual than that."""
 _LEAST_GAIN = 0.5
 """Smallest fall of the cost, nats, for which another set is fitted."""
 _MOST_FITS = 2
-"""Failed fits of a round after which only smaller sets are fitted, which gain more reliably."""
+"""Failed fits of a round, with additions or without, after which only smaller sets of that kind are
+fitted, which gain more reliably."""
 _MOST_ADDED = 3
 """Largest number of effects added at once to a set that has been fitted."""
 
@@ -217,7 +218,9 @@ def _fit_better(
     broken: list[set[Key]] = []
     kept: dict[tuple[str, ...], float] = {}
     for keys in better:
-        if added_effects(keys) and len(broken) >= _MOST_FITS and len(keys) >= min(map(len, broken)):
+        adds = bool(added_effects(keys))
+        alike = [len(one) for one in broken if bool(added_effects((*one,))) == adds]
+        if len(alike) >= _MOST_FITS and len(keys) >= min(alike):
             continue
         # A set that contains one whose fit failed is no better.
         if any(one <= {*keys} for one in broken):

@@ -295,6 +295,7 @@ class Session:
             promised = problem.solve()
             if here - promised.cost < _CONVERGED:
                 break
+            lightest = damping
             for _ in range(_MOST_TRIED):
                 solved = problem.solve_damped(damping) if damping else promised
                 step = problem.to_parameters @ solved.base
@@ -319,7 +320,8 @@ class Session:
             fall, linearisation, problem, here = here - there, moved, tried, there
             if fall < _LEAST_FALL:
                 break
-            damping = 0.1 * damping if damping > _LEAST_DAMPING else 0.0
+            if damping == lightest:
+                damping = 0.1 * damping if damping > _LEAST_DAMPING else 0.0
         return linearisation, problem
 
     def judge(self, spec: ModelSpec, p: Array, count: int = 0) -> "Fit":
