@@ -38,8 +38,8 @@ model linearised far from the truth leaves a larger residual than that."""
 _LEAST_GAIN = 0.5
 """Smallest fall of the cost, nats, for which another set is fitted."""
 _MOST_FITS = 2
-"""Failed fits of a round, with additions or without, after which only smaller sets of that kind are
-fitted, which gain more reliably."""
+"""Failed fits of a round after which only smaller sets are fitted, which gain more reliably; and
+removals that are fitted if the model may lie far from the truth."""
 _MOST_ADDED = 3
 """Largest number of effects added at once to a set that has been fitted."""
 
@@ -218,9 +218,7 @@ def _fit_better(
     broken: list[set[Key]] = []
     kept: dict[tuple[str, ...], float] = {}
     for keys in better:
-        adds = bool(added_effects(keys))
-        alike = [len(one) for one in broken if bool(added_effects((*one,))) == adds]
-        if len(alike) >= _MOST_FITS and len(keys) >= min(alike):
+        if added_effects(keys) and len(broken) >= _MOST_FITS and len(keys) >= min(map(len, broken)):
             continue
         # A set that contains one whose fit failed is no better.
         if any(one <= {*keys} for one in broken):
@@ -247,15 +245,15 @@ def _without_weakest(search: Search, given: Collection[str]) -> list[tuple[Key, 
     """Return the removals of the weakest effects if the shapes of others could replace them.
 
     The linear problem at the present shapes does not show how well they could. It may be wrong of
-    any effect where a residual exceeds noise and discrepancy, else of the weakest alone.
+    several effects where a residual exceeds noise and discrepancy, else of the weakest alone.
     """
     p = search.problem
     own = sorted(
         (e for e in p.absence if e not in given), key=lambda e: search.cost(((f"-{e}", ()),))
     )
-    weakest = own if np.any(compute_excess(search) > 0.5) else own[:1]
-    shaped = [e for e in own if p.shapes[e]]
-    return [((f"-{e}", ()),) for e in weakest if {*shaped} - {e}]
+    shaped = {e for e in own if p.shapes[e]}
+    weakest = [((f"-{e}", ()),) for e in own if shaped - {e}]
+    return weakest[: _MOST_FITS if np.any(compute_excess(search) > 0.5) else 1]
 
 
 def _leave_out(
