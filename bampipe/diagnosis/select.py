@@ -252,7 +252,7 @@ def _without_weakest(search: Search, given: Collection[str]) -> list[tuple[Key, 
         (e for e in p.absence if e not in given), key=lambda e: search.cost(((f"-{e}", ()),))
     )
     shaped = {e for e in own if p.shapes[e]}
-    weakest = [((f"-{e}", ()),) for e in own if shaped - {e}]
+    weakest: list[tuple[Key, ...]] = [((f"-{e}", ()),) for e in own if shaped - {e}]
     return weakest[: _MOST_FITS if np.any(compute_excess(search) > 0.5) else 1]
 
 

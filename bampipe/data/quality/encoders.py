@@ -170,8 +170,8 @@ def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> No
             shown = ", ".join(f"{e.name} {travel[e.name]:.2g} {e.unit}" for e in session.encoders)
             raise table.fault(
                 f"declared {entry.kind}, but never moves ({shown})",
-                remedy="were the encoders on, and is their unit right? or is it a locked trial? of a"
-                " machine that moves no further, lower still_m or still_rad in [settings.ingest]",
+                remedy="were the encoders on, and is their unit right? or is it a locked trial? if"
+                " the machine moves no further, lower still_m or still_rad in [settings.ingest]",
             )
         for encoder in session.encoders:
             if travel[encoder.name] == 0.0:
