@@ -14,9 +14,9 @@ from bampipe.physics.effect import BoundEffect
 from bampipe.physics.parameter import Parameter
 from bampipe.trials.linearisation import Linearisation
 
-_TRAVEL = (1e-4, 0.25)
+_TRAVEL = (1e-4, 0.1)
 """Lengths, as shares of the travel; a shorter one is crossed within a sample or two."""
-_SPEED = (1e-3, 1.0)
+_SPEED = (2e-3, 0.5)
 """Speeds, as shares of the highest speed."""
 _WAVES = (2.0, 30.0)
 """Wavenumbers, in waves on the travel."""
