@@ -1,7 +1,5 @@
 """On a cold start, processes beside the run compile what later stages need; once warm, none do."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -19,7 +17,7 @@ class Started:
         self.codes: list[str] = []
         self.ended = 0
 
-    def __call__(self, command: list[str], **_: Any) -> Started:
+    def __call__(self, command: list[str], **_: Any) -> "Started":
         self.codes.append(command[-1])
         return self
 

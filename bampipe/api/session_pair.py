@@ -269,7 +269,7 @@ def _describe_journey(model: _Side, trials: _Side, e: Linearisation) -> Journey:
     of_spread = np.einsum("kaij,ij->a", e.sums.xx[judged], model.covariance(e))
     spread = np.sqrt(np.maximum(of_spread, 0.0) / count)
     error = np.sqrt(e.sums.yy[judged].sum(axis=0) / count)
-    axes, own = {}, []
+    axes = {}
     for i, axis in enumerate(e.system.coordinates):
         judge = trials.validated.axes[axis]
         least = judge.noise_floor
@@ -282,11 +282,10 @@ def _describe_journey(model: _Side, trials: _Side, e: Linearisation) -> Journey:
             noise_floor=judge.noise_floor, limit=limit, unit=judge.unit,
             travels=bool(error[i] <= limit),
         )  # fmt: skip
-        own.append(max(limit, 1e-12))
     journey = Journey(model_of=model.name, trials_of=trials.name, effects=model.effects, axes=axes)
     if not journey.failed:
         return journey
-    limits = np.array(own)
+    limits = np.array([max(one.limit, 1e-12) for one in axes.values()])
     alone = [_refit(e, [k], limits) for k in range(len(e.free))]
     alone.sort(key=lambda one: float(np.sum((np.array([*one.errors.values()]) / limits) ** 2)))
     together = _refit_together(e, limits)

@@ -15,7 +15,7 @@ from bampipe.cli.options import (
     RunsOption,
 )
 from bampipe.data.run_folder import RunFolder
-from bampipe.errors import InputError, choose_from, did_you_mean, located
+from bampipe.errors import InputError, did_you_mean, located
 
 
 def status_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption = False) -> None:
@@ -161,11 +161,5 @@ def fetch(
     if not known:
         raise InputError("nothing is published here", where=url)
     for session in sessions or known:
-        if session not in known:
-            raise InputError(
-                f"no session {session!r} is published",
-                where=url,
-                remedy=choose_from(session, known),
-            )
         show.say(str(publish.fetch(url, session, runs, force)))
     show.print_advice(f"bampipe lab {runs}", quiet)

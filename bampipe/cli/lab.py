@@ -61,10 +61,11 @@ def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> "Lab":
 
 def refresh(runs: Path, several: bool, quiet: bool) -> None:
     """Bring the lab's folder up to date after a run, if there is one; ``several`` make one."""
-    from bampipe.lab.folders import FILE, is_current, is_foreign, lab_folder, run_folders
+    from bampipe.lab.folders import is_current, is_foreign, lab_folder, run_folders
+    from bampipe.results.lab import LabResult
 
     folder = lab_folder(runs)
-    wanted = several or (folder / FILE).is_file()
+    wanted = several or (folder / LabResult.FILE).is_file()
     begun = any((root / "ingest" / "session.json").is_file() for root in run_folders(runs))
     if not wanted or not begun or is_current(runs, folder):
         return

@@ -5,7 +5,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -112,7 +112,7 @@ def monitor(
 
 def follow(stream: "SampleStream", watch: "Monitor", output: "_Output", wait: bool) -> None:
     """Filter the stream to its end, or if ``wait``, until the user stops it."""
-    try:
+    with suppress(KeyboardInterrupt):
         while True:
             values = stream.read(last=not wait)
             if len(values):
@@ -125,8 +125,6 @@ def follow(stream: "SampleStream", watch: "Monitor", output: "_Output", wait: bo
                 if not wait:
                     break
                 time.sleep(POLL_S)
-    except KeyboardInterrupt:
-        pass
     output.show(watch, stream, final=True)
 
 

@@ -1,7 +1,5 @@
 """A motion smoothed for regressions, and what of a drive follows the angle of its axis."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -43,7 +41,7 @@ class SmoothedMotion:
     position: Array
 
     @classmethod
-    def of(cls, t: Array, q: Array) -> SmoothedMotion | None:
+    def of(cls, t: Array, q: Array) -> "SmoothedMotion | None":
         """Smooth a position ``q`` (T,) at ``t`` (T,), s; None where it is too short."""
         step = float(np.median(np.diff(t)))
         width = max(5, round(_SMOOTHED_S / step) | 1)

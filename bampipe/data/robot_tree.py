@@ -1,7 +1,5 @@
 """The links of a robot, as rigid bodies, and the joints between them, as a file draws them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -34,17 +32,17 @@ class Body:
     inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     @classmethod
-    def of_table(cls, table: Mapping[str, Any]) -> Body:
+    def of_table(cls, table: Mapping[str, Any]) -> "Body":
         """The body that the entry of a joint or payload in a device file describes."""
         center = np.array(table.get("center", (0.0,) * 3), dtype=float)
         inertia = symmetric(table.get("inertia", (0.0,) * 6))
         return cls(float(table.get("mass", 0.0)), center, inertia)
 
-    def moved(self, turn: Array, offset: Array) -> Body:
+    def moved(self, turn: Array, offset: Array) -> "Body":
         """The same body seen from a frame in which its own lies at ``offset``, ``turn``."""
         return Body(self.mass, turn @ self.center + offset, turn @ self.inertia @ turn.T)
 
-    def joined(self, other: Body) -> Body:
+    def joined(self, other: "Body") -> "Body":
         """Both as one."""
         mass = self.mass + other.mass
         if mass == 0.0:
@@ -52,7 +50,7 @@ class Body:
         center = (self.mass * self.center + other.mass * other.center) / mass
         return Body(mass, center, self.about(center) + other.about(center))
 
-    def without(self, other: Body) -> Body:
+    def without(self, other: "Body") -> "Body":
         """What is left when a part of it is taken off."""
         return self.joined(Body(-other.mass, other.center, -other.inertia))
 

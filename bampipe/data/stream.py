@@ -1,7 +1,5 @@
 """Samples as they come: lines of a growing text file or of a pipe, checked and in SI units."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -40,7 +38,7 @@ class StreamLayout:
     may_lack: NDArray[np.bool_]
 
     @staticmethod
-    def in_si(names: Sequence[str]) -> StreamLayout:
+    def in_si(names: Sequence[str]) -> "StreamLayout":
         """Columns that are named and measured as in ``ingest/samples.parquet``."""
         columns = ("t", *names)
         return StreamLayout(
@@ -49,7 +47,7 @@ class StreamLayout:
         )  # fmt: skip
 
     @staticmethod
-    def of_session(session: Session) -> StreamLayout:
+    def of_session(session: Session) -> "StreamLayout":
         """Columns as a session file describes its raw logs.
 
         Raises:

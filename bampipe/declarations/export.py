@@ -197,7 +197,7 @@ def _identified_joints(
     robot: Robot, system: System, p: Array
 ) -> tuple[dict[str, Body], dict[str, DriveLimits]]:
     """Return bodies by joint, and limits, friction and inertia of the joints' drives."""
-    value = {item.name: float(p[i]) for i, item in enumerate(system.parameters)}
+    value = system.by_name(p)
     drives = dict(zip(system.coordinates, np.diag(_drive_inertia(system, p)), strict=True))
     bodies, limits = {}, {}
     for joint in robot.joints:

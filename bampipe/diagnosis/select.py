@@ -379,9 +379,7 @@ def start_at(search: Search, base: Array, known: Mapping[str, float], wider: Mod
     They are those of the model after the change ``base`` of its linear problem, and ``known`` ones.
     """
     linearisation = search.dictionary.linearisation
-    found = {
-        q.name: v for q, v in zip(linearisation.system.parameters, linearisation.p, strict=True)
-    }
+    found = linearisation.system.by_name(linearisation.p)
     change = search.problem.to_parameters @ base
     for place, number in enumerate(linearisation.free):
         found[linearisation.system.parameters[number].name] += change[place]

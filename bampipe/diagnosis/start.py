@@ -46,10 +46,7 @@ def search_start(trials: MeasuredTrials, spec: ModelSpec) -> Array:
             current = replace(current, effects=(*current.effects, *found))
             start = start_of(search, keys, current)
         fit, left = _fit(session, current, start), tuple(e for e in left if e not in found)
-    known = {
-        q.name: v
-        for q, v in zip(fit.linearisation.system.parameters, fit.linearisation.p, strict=True)
-    }
+    known = fit.linearisation.system.by_name(fit.linearisation.p)
     return np.array([known[q.name] for q in system_of(spec).parameters])
 
 

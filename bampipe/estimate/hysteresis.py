@@ -23,6 +23,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import butter, find_peaks, sosfiltfilt
 
 from bampipe.arrays import Array
+from bampipe.compiled import njit
 from bampipe.estimate.white_noise import white_noise_sd
 
 _TREMOR_HZ = 5.0
@@ -311,3 +312,17 @@ def _measure_cycle(
         energy=energy_lost(load, moved, 1.0 / line.compliance),
         amplitude=0.5 * float(np.ptp(load)), centre=float(0.5 * (falling + rising)),
     )  # fmt: skip
+
+
+@njit("float64[::1](float64[::1], float64)")
+def drag_along(x: Array, play: float) -> Array:
+    """Return positions (T,) of a point that stays within ``play`` of ``x`` (T,).
+
+    This is the play operator of Krasnosel'skii and Pokrovskii 1989, Systems with Hysteresis.
+    """
+    out = np.empty(x.shape[0])
+    at = x[0]
+    for t in range(x.shape[0]):
+        at = min(max(at, x[t] - play), x[t] + play)
+        out[t] = at
+    return out

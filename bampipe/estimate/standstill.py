@@ -5,7 +5,7 @@ At standstill, Coulomb friction balances any load, and the sign of the velocity 
 
 import numpy as np
 
-from bampipe.arrays import Array, Flags
+from bampipe.arrays import Array, Flags, find_runs
 from bampipe.estimate.low_pass import Band
 
 REST_S = 0.03
@@ -35,7 +35,8 @@ def find_standstill(qd: Array, qd_sd: Array, rate_hz: float, braked: Flags | Non
     still = np.zeros(qd.shape, dtype=bool)
     longest = int(REST_S * rate_hz)
     for column, v, limit, loose in zip(still.T, qd.T, slow.T, ringing.T, strict=True):
-        for start, end in [*find_runs(np.abs(v) < limit), *_ringing(v, loose)]:
+        runs = zip(*find_runs(np.abs(v) < limit), strict=True)
+        for start, end in (*runs, *_ringing(v, loose)):
             if end - start - _turning(v, limit, start, end) > longest:
                 column[start:end] = True
     if braked is not None:
@@ -52,16 +53,10 @@ def find_turns(qd: Array, rate_hz: float) -> Flags:
     return turns
 
 
-def find_runs(chosen: Flags) -> list[tuple[int, int]]:
-    """Return the first sample, and the one after the last, of every run of chosen samples."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
 def _ringing(v: Array, limit: Array) -> list[tuple[int, int]]:
     """Find runs in which a velocity (T,) within a limit (T,) oscillates, sign changes included."""
     found = []
-    for start, end in find_runs(np.abs(v) < limit):
+    for start, end in zip(*find_runs(np.abs(v) < limit), strict=True):
         turns = start + np.flatnonzero(np.diff(np.sign(v[start:end])))
         if len(turns) > 1:
             found.append((int(turns[0]), int(turns[-1]) + 2))

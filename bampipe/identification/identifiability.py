@@ -146,7 +146,7 @@ def find_information(
     slope *= ~problem.standstill[trial][:, :, None]
     push = system.input_map(motion.q, u, own) * noise.noise_sd[force_noise_mask(system)]
     inertia = np.diagonal(system.mass_matrix(motion.q, own), axis1=1, axis2=2).mean(axis=0)
-    known = {item.name: value for item, value in zip(system.parameters, own, strict=True)}
+    known = system.by_name(own)
     damping = np.array([known.get(f"viscous.{axis}", 0.0) for axis in system.coordinates])
     stiffness = _stiffness(system, motion, z, u, own)
     spectrum = residual_spectrum(

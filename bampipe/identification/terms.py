@@ -82,7 +82,7 @@ def describe_terms(
     samples = _Samples(fitted, trials.band, used, error)
     from bampipe.physics.readable import model_equations
 
-    values = {item.name: float(value) for item, value in zip(system.parameters, p, strict=True)}
+    values = system.by_name(p)
     try:
         equations = model_equations(system.model, values)
     except InputError:  # deriving them takes too long

@@ -6,7 +6,6 @@ from bampipe.errors import InputError
 from bampipe.results.lab import LabResult
 from bampipe.run import record
 
-FILE = "lab.json"
 LOCK = ".lock"
 
 
@@ -27,7 +26,7 @@ def is_foreign(folder: Path) -> bool:
 
 def is_current(runs: Path, folder: Path) -> bool:
     """Return whether ``folder`` holds all runs in ``runs``, none of them younger."""
-    about = folder / FILE
+    about = folder / LabResult.FILE
     if not about.is_file():
         return False
     written = about.stat().st_mtime_ns

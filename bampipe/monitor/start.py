@@ -16,6 +16,7 @@ from bampipe.errors import InputError
 from bampipe.estimate.consistency import Reference, window_means
 from bampipe.estimate.square_root import FilterSettings
 from bampipe.estimate.unscented import FilterFailure, FilterModel, Trial, filter_trials
+from bampipe.files import cannot
 from bampipe.identification.filter_run import build_filter_model, infer_initial_state
 from bampipe.physics import System, compile_model
 from bampipe.results.identify import IdentifyResult
@@ -145,9 +146,7 @@ def open_stream(
     try:
         descriptor = os.open(samples, os.O_RDONLY)
     except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror}", where=samples, remedy="name the growing file"
-        ) from error
+        raise cannot("read", Path(samples), error) from error
     return SampleStream(descriptor, samples, known, strict, complain)
 
 

@@ -54,7 +54,7 @@ def compare_alternatives(session: Session, final: Fit, odds: Odds) -> Comparison
     """
     members = {name for one in odds for name in one}
     spec, e = change_effects(final.spec, members), final.linearisation
-    known = {q.name: v for q, v in zip(e.system.parameters, e.p, strict=True)}
+    known = e.system.by_name(e.p)
     start = np.array([known[q.name] for q in system_of(spec).parameters])
     linearisation = session.linearise(spec, start)
     bare = Fit(spec, linearisation, final.likelihood, pose_problem(final.likelihood, linearisation))
@@ -79,8 +79,7 @@ def _fit_alternative(
     if not np.isfinite(search.cost(keys)):
         return None
     wider = change_effects(spec, (), members)
-    pairs = zip(system_of(wider).parameters, start_of(search, keys, wider), strict=True)
-    start = {q.name: value for q, value in pairs}
+    start = system_of(wider).by_name(start_of(search, keys, wider))
     items = tuple(search.dictionary.candidates[name] for name in members)
     values = tuple(np.array([start[q.name] for q in item.parameters]) for item in items)
     slopes = tuple(

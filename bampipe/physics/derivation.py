@@ -304,16 +304,15 @@ def _add(one: Sequence[Any], other: Sequence[Any]) -> list[Any]:
 
 def _apply_lagrange(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
     """Lagrange's equation of all energies, one after the other."""
-    n, mass_terms, bias_terms = len(d.axes), [], []
+    n = len(d.axes)
+    mass, bias = [[sp.S.Zero] * n for _ in range(n)], [sp.S.Zero] * n
     for label, tree, kinetic, potential in energies:
         try:
-            mass, bias = lagrange(kinetic, potential, tuple(d.q), tuple(d.qd))
+            own_mass, own_bias = lagrange(kinetic, potential, tuple(d.q), tuple(d.qd))
         except OutOfTime:
             raise d.too_long(tree, label) from None
-        mass_terms.append(mass)
-        bias_terms.append(bias)
-    mass = [[sum((m[i][j] for m in mass_terms), sp.S.Zero) for j in range(n)] for i in range(n)]
-    bias = [sum((h[i] for h in bias_terms), sp.S.Zero) for i in range(n)]
+        mass = [_add(*rows) for rows in zip(mass, own_mass, strict=True)]
+        bias = _add(bias, own_bias)
     symbols_allowed = [*d.q, *d.qd, *d.p.values(), *d.constants]
     for row, term in zip(mass, bias, strict=True):
         allow("the equation of motion", [*row, term], symbols_allowed, "motion and parameters")

@@ -1,7 +1,5 @@
 """The compiled model: generated functions, loaded from a cache on disk if they exist."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -129,7 +127,7 @@ class System:
         ]
 
     @cached_property
-    def _effects_on_force(self) -> list[tuple[list[int], System]]:
+    def _effects_on_force(self) -> "list[tuple[list[int], System]]":
         """Each effect that changes how a force acts: numbers of its parameters, and it alone."""
         names, found = [q.name for q in self.parameters], list[tuple[list[int], System]]()
         for item in self.model.effects if self.driven or self.force_fed else ():
@@ -171,6 +169,10 @@ class System:
         one_by_one = all(self.linear[i] for i in chosen)
         return one_by_one and not any(chosen.issuperset(pair) for pair in self._products)
 
+    def by_name(self, p: Array) -> dict[str, float]:
+        """The parameters ``p`` (n_p,) by name."""
+        return {q.name: float(value) for q, value in zip(self.parameters, p, strict=True)}
+
     def index(self, name: str) -> int:
         """Position of the parameter called ``name``.
 
@@ -187,7 +189,7 @@ class System:
     def _whole(self) -> generated_code.Generated:
         """Functions of the whole mechanism, which most candidates of a diagnosis never need."""
 
-        def generate() -> Generation:
+        def generate() -> "Generation":
             from bampipe.physics.model_code import whole_code
 
             return whole_code(self.model)
@@ -445,7 +447,7 @@ def compile_model(model: Model) -> System:
         InputError: an expression of the model is wrong, or the cache cannot be used.
     """
 
-    def generate() -> Generation:
+    def generate() -> "Generation":
         from bampipe.physics.model_code import effects_code
 
         return effects_code(model)

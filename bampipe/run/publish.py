@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.errors import InputError
+from bampipe.errors import InputError, choose_from
 from bampipe.files import digest_content, digest_file, json_text, parse_json
 from bampipe.results.run import PRIVATE, Published
 from bampipe.run.session_name import is_name
@@ -86,7 +86,8 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     with _driver("cannot be fetched", url):
         current = _current(system, here)
         if current is None:
-            raise InputError(f"no session {session!r} is published", where=url)
+            remedy = choose_from(session, published(url))
+            raise InputError(f"no session {session!r} is published", where=url, remedy=remedy)
         stored = ((root / name, known) for name, known in current.files.items())
         if root.exists() and all(p.is_file() and digest_file(p) == known for p, known in stored):
             return root

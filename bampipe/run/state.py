@@ -116,7 +116,9 @@ class RunState:
                     others = {k: made.key for k, made in self.records.items() if k != step.name}
                     found[name] = digest_content(others)
                     continue
-                self.check_untouched(name)
+                for other, made in self.records.items():
+                    if name in made.outputs and self.digest(name) != made.outputs[name]:
+                        raise record.touched(self.root, name, other)
                 is_text = name.endswith(".toml")
                 found[name] = digest_input(self.root / name) if is_text else self.digest(name)
         if step.stage in base.READS_SESSION:
@@ -127,12 +129,6 @@ class RunState:
         maker = _maker(name)
         reads = "SESSION" if maker in base.READS_SESSION else self.root
         return self.folder.missing(name, f"{maker} {reads}" if maker else "")
-
-    def check_untouched(self, name: str) -> None:
-        for step, made in self.records.items():
-            written = made.outputs.get(name)
-            if written is not None and self.digest(name) != written:
-                raise record.touched(self.root, name, step)
 
     def key(self, step: Step, config: Mapping[str, object], inputs: Mapping[str, str]) -> str:
         return digest_content(

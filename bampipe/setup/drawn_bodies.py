@@ -5,8 +5,6 @@ uncertainty, and leave little error. Drawn bodies cannot. A body that is far hea
 found by its share in all drives.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -91,11 +89,11 @@ class JointMotion:
     rate: Array
     change: Array
 
-    def rows(self, rows: slice | Indices) -> JointMotion:
+    def rows(self, rows: slice | Indices) -> "JointMotion":
         """The motion at some samples."""
         return JointMotion(self.position[rows], self.rate[rows], self.change[rows])
 
-    def reread(self, gain: Array, time: float = 1.0) -> JointMotion:
+    def reread(self, gain: Array, time: float = 1.0) -> "JointMotion":
         """Motion of joints that are ``gain`` (n, n) times these, by a clock ``time`` slower."""
         return JointMotion(
             self.position @ gain.T, self.rate @ gain.T / time, self.change @ gain.T / time**2
@@ -141,7 +139,7 @@ class Comparison:
         n, gravity = len(self.ratio), np.array(self.robot.gravity, dtype=float)
         return Mounting(np.ones(n), np.zeros(n), gravity)
 
-    def reread(self, gain: Array, time: float = 1.0) -> Comparison:
+    def reread(self, gain: Array, time: float = 1.0) -> "Comparison":
         """The comparison with other readings of the joints; see `JointMotion.reread`."""
         motions = [m.reread(gain, time) for m in self.motions]
         return replace(self, motions=motions, _required={})
@@ -205,7 +203,7 @@ class Comparison:
         ]
 
     @cached_property
-    def losses(self) -> list[Losses]:
+    def losses(self) -> "list[Losses]":
         """Losses of each drive; the sign is that of the joint, whichever way the motor turns."""
         found = []
         for k, way in enumerate(np.sign(self.ratio)):
@@ -241,7 +239,7 @@ class Comparison:
             for k, (loss, sums) in enumerate(zip(self.losses, self._sums[key], strict=True))
         ]
 
-    def best_mounting(self, roughly: Comparison, doubted: float) -> Mounting:
+    def best_mounting(self, roughly: "Comparison", doubted: float) -> Mounting:
         """Return the mounting with which the drawing explains most of ``roughly`` the same.
 
         It is the nominal one if that leaves less than the fraction ``doubted`` of every drive.
@@ -279,7 +277,7 @@ class Losses:
     known: bool
 
     @classmethod
-    def of(cls, columns: Array, powers: Array, drive: Array, has_offset: bool) -> Losses:
+    def of(cls, columns: Array, powers: Array, drive: Array, has_offset: bool) -> "Losses":
         """Compute losses from columns (K, m), the mean power per unit of each, and the drive."""
         if has_offset:
             columns, powers = np.column_stack([columns, np.ones(len(drive))]), np.append(powers, 0)

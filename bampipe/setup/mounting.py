@@ -6,8 +6,6 @@ torso. Weight varies with the sines of the angles, so drawn bodies explain the d
 right zeros and the right gravity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
@@ -67,13 +65,13 @@ class Mounting:
         pairs = zip(self.direction, self.zero, strict=True)
         return [(float(direction), float(zero)) for direction, zero in pairs]
 
-    def under(self, down: Array) -> Mounting:
+    def under(self, down: Array) -> "Mounting":
         """The same mounting with its gravity along ``down``, (3,)."""
         size = float(np.linalg.norm(self.gravity))
         gravity = size * down / np.linalg.norm(down)
         return Mounting(self.direction, self.zero, gravity, hangs=True)
 
-    def counted(self, options: dict[int, tuple[float, float]]) -> Mounting:
+    def counted(self, options: dict[int, tuple[float, float]]) -> "Mounting":
         """The same mounting with other directions and zeros of some joints, by their numbers."""
         direction, zero = self.direction.copy(), self.zero.copy()
         for k, option in options.items():

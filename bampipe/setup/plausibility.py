@@ -1,7 +1,5 @@
 """Plausibility of a set-up: the error that it leaves, and the parameters that it implies."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -73,7 +71,7 @@ class Plausibility:
         errors = np.log(np.hypot(self.error, least))
         return float(WEIGHT * errors.sum() + self.objections.sum())
 
-    def with_nothing_explained(self) -> Plausibility:
+    def with_nothing_explained(self) -> "Plausibility":
         """The plausibility of a set-up under which the device cannot be computed."""
         nothing, objections = np.full_like(self.error, 1e3), np.full_like(self.objections, 0.5)
         return replace(self, error=nothing, moving=np.ones_like(nothing), objections=objections)

@@ -47,10 +47,6 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
         raise InputError("exists and is not an empty folder", where=str(out))
     specimen, strengths = draw_specimen(config)
     trials = _list_trials(specimen.device, config)
-    try:
-        (out / "trials").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make the folder: {error.strerror}", where=str(out)) from error
     for number, trial in enumerate(trials):
         rng = np.random.default_rng([config.seed, 1 + number])
         if trial["kind"] == "locked":

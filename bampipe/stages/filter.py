@@ -109,7 +109,7 @@ class _Written:
         skipped: by trial, why it was not differentiated.
     """
 
-    levels: dict[str, list[tuple[float, float, float]]]
+    levels: dict[str, list[Array]]
     interpolated: dict[str, float]
     skipped: dict[str, str]
 
@@ -375,6 +375,7 @@ def _choose(
     axis: str, records: list[tuple[Array, Flags]], rate: float, resolution: float, config: Config
 ) -> tuple[AxisFilter, dict[str, Any]]:
     """Return how to differentiate ``axis``, of which there are these ``records``, and why."""
+    most = 0.2 * rate
     shown = [white_noise_sd(x[seen]) for x, seen in records]
     quietest = max(float(np.nanmin([*shown, np.inf])), resolution / float(np.sqrt(12.0)))
     records = [(x, seen) for x, seen in records if not _outruns(x, quietest)] or records
@@ -384,7 +385,7 @@ def _choose(
             rate,
             resolution,
             order=order,
-            bandwidth_limits_hz=(min(3.0, 0.01 * rate), 0.2 * rate),
+            bandwidth_limits_hz=(min(3.0, 0.01 * rate), most),
         )
         for order in kalman_smoother.ORDERS
     }
@@ -397,8 +398,6 @@ def _choose(
         )
     order = max(fits, key=lambda k: fits[k][1])
     best, _ = fits[order]
-    noise_sd = best.noise_sd
-    most = 0.2 * rate
     least = min(config.minimum_bandwidth_hz, most)
     kalman = config.method in ("auto", "kalman")
     found = best.bandwidth_hz
@@ -420,11 +419,11 @@ def _choose(
         "bandwidth_hz": cutoff,
         "bandwidth_reason": why,
         "order": order if kalman else None,
-        "measurement_noise_sd": noise_sd,
+        "measurement_noise_sd": best.noise_sd,
         "resolution": resolution,
         "log_likelihood": {str(k): likely for k, (_, likely) in fits.items()},
     }
-    return AxisFilter(cutoff, noise_sd, order if kalman else 0), report
+    return AxisFilter(cutoff, best.noise_sd, order if kalman else 0), report
 
 
 def _outruns(position: Array, noise_sd: float) -> bool:
@@ -439,8 +438,8 @@ def _outruns(position: Array, noise_sd: float) -> bool:
 
 def _differentiate(
     trial_id: str, frame: pd.DataFrame, kinematics: Kinematics
-) -> tuple[pd.DataFrame, dict[str, tuple[float, float, float]]]:
-    """Return the rows of one trial and, per axis, the median error bands (position, ...)."""
+) -> tuple[pd.DataFrame, dict[str, Array]]:
+    """Return the rows of one trial and, by axis, the median of each of its error bands, (3,)."""
     grid = uniform_grid(frame["t"].to_numpy(dtype=np.float64), kinematics.rate_hz)
     columns: dict[str, object] = {"trial_id": trial_id, "t": grid.t}
     columns["stamp_offset"] = grid.stamp_offset
@@ -465,7 +464,6 @@ def _differentiate(
     for axis, motion in motions.items():
         sds = (motion.position_sd, motion.velocity_sd, motion.acceleration_sd)
         columns |= zip((f"{rate}_sd_{axis}" for rate in ("q", "qd", "qdd")), sds, strict=True)
-        position, velocity, acceleration = (float(np.median(sd)) for sd in sds)
-        medians[axis] = (position, velocity, acceleration)
+        medians[axis] = np.median(sds, axis=1)
     columns["bridged"] = grid.bridged
     return pd.DataFrame(columns), medians

@@ -384,7 +384,7 @@ def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison 
         return None
     final = change_effects(case.spec, (), diagnosed.selected)
     known = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
-    known |= {q.name: value for q, value in zip(case.system.parameters, case.p, strict=True)}
+    known |= case.system.by_name(case.p)
     start = np.array([known.get(q.name, q.prior) for q in system_of(final).parameters])
     fit = case.session.try_fit(final, start)
     return compare_alternatives(case.session, fit, asked) if fit is not None else None

@@ -52,10 +52,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     p = read_estimate(run, config.model, system)
     # The range of each axis that the moving trials covered, (n_q, 2).
     columns = [f"q_{axis}" for axis in system.coordinates]
-    q = read_parquet(run.require("filter/kinematics.parquet", "filter"), columns=columns)
-    reach = np.stack(
-        [np.nanmin(q.to_numpy(dtype=float), 0), np.nanmax(q.to_numpy(dtype=float), 0)], 1
-    )
+    moved = read_parquet(run.require("filter/kinematics.parquet", "filter"), columns=columns)
+    q = moved.to_numpy(dtype=float)
+    reach = np.stack([np.nanmin(q, axis=0), np.nanmax(q, axis=0)], axis=1)
     # Its largest quantile leaves out the noise of the force sensor.
     samples = run.require("ingest/samples.parquet", "ingest")
     sizes = np.linalg.norm(read_parquet(samples, columns=[*device.forces]).dropna(), axis=1)
@@ -93,8 +92,7 @@ def _handle(run: RunFolder, system: System, p: Array, reach: Array, points: int)
     """
     device, axes = system.model.device, system.coordinates
     grid = _grid(reach, points)
-    no_input = np.zeros((len(grid), len(system.inputs)))
-    gain = system.input_map(grid, no_input, p)
+    gain = system.input_map(grid, p=p)
     regular = np.abs(np.linalg.det(gain)) > 1e-9
     if not regular.any():
         raise InputError(
@@ -104,7 +102,7 @@ def _handle(run: RunFolder, system: System, p: Array, reach: Array, points: int)
         )
     back = np.linalg.inv(gain[regular])
     swept = "m" if len(axes) == 1 else f"m{len(axes)}"
-    known = {item.name: value for item, value in zip(system.parameters, p, strict=True)}
+    known = system.by_name(p)
     coulomb = np.array([known.get(f"coulomb.{axis}", 0.0) for axis in axes])
     compliance = np.linalg.inv(system.mass_matrix(grid[regular], p))
     mobility = np.einsum("tij,tik,tkl->tjl", gain[regular], compliance, gain[regular])
@@ -132,7 +130,7 @@ def _volume(system: System, reach: Array, p: Array, points: int) -> float:
     width = (reach[:, 1] - reach[:, 0]) / points
     inner = np.stack([reach[:, 0] + width / 2.0, reach[:, 1] - width / 2.0], axis=1)
     grid = _grid(inner, points)
-    gain = system.input_map(grid, np.zeros((len(grid), len(system.inputs))), p)
+    gain = system.input_map(grid, p=p)
     return float(np.abs(np.linalg.det(gain)).sum() * np.prod(width))
 
 

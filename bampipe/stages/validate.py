@@ -203,11 +203,9 @@ def _result(
             noise_floor_sd=scatter,
             standing=compare_with_floor(found.held_out_rmse, level, scatter),
         )
-    forces = {}
-    for column, name in enumerate(system.model.device.forces):
-        error_of = np.concatenate([c.force_residual[c.used.all(axis=1), column] for c in compared])
-        rmse = np.sqrt(np.mean(error_of**2)) if error_of.size else 0.0
-        forces[name] = ForceError(rmse=rmse, unit=system.model.device.force_unit)
+    device, used = system.model.device, [c.used.min(axis=1, keepdims=True) for c in compared]
+    sizes = zip(device.forces, rms((c.force_residual for c in compared), used), strict=True)
+    forces = {name: ForceError(rmse=size, unit=device.force_unit) for name, size in sizes}
     fits = {axis: e.fit_percent for axis, e in axes.items() if e.fit_percent is not None}
     best = ", ".join(f"{axis} {fit:.1f} %" for axis, fit in fits.items())
     on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"

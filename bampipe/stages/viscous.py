@@ -103,9 +103,9 @@ def _estimated(
     progress: Progress,
 ) -> tuple[ViscousResult, pd.DataFrame]:
     """Return the content of viscous.json, and the convergence of the estimates."""
-    known, start = identified.parameters, system.prior
-    for i, item in enumerate(system.parameters):
-        start[i] = known[item.name].estimate if item.name in known else start[i]
+    known = identified.parameters
+    estimates = {name: one.estimate for name, one in known.items()}
+    start = np.array([estimates.get(item.name, item.prior) for item in system.parameters])
     settings = untuned_settings(read_sensors(run, system), system, motions, start, config)
     settings = settings._replace(stride=filter_run.choose_stride(motions))
     if identified.noise is not None and config.force_noise == 0.0:
@@ -120,7 +120,6 @@ def _estimated(
     late_s = identified.input_timing.estimate
     model = filter_run.build_filter_model(system, readings, start, False, late_s)
     command = float(np.nanmean(commanded)) if np.isfinite(commanded).any() else None
-    estimates = {name: one.estimate for name, one in known.items()}
     value = np.array([estimates.get(item.name, command or 0.0) for item in free])
     sd = np.array([known[item.name].sd if item.name in known else item.sd for item in free])
     sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
@@ -190,7 +189,7 @@ def _device_damping(system: System, motions: Sequence[Motion], p: Array) -> Arra
 
     q' = B^-T v, so that joint damping D is felt as B^-1 D B^-T.
     """
-    parameters = {item.name: value for item, value in zip(system.parameters, p, strict=True)}
+    parameters = system.by_name(p)
     joint = np.diag([parameters.get(f"viscous.{axis}", 0.0) for axis in system.coordinates])
     felt = []
     for motion in motions:

@@ -12,10 +12,9 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
-from bampipe.arrays import Array, Flags, Indices
+from bampipe.arrays import Array, Flags, Indices, find_runs
 from bampipe.estimate.least_squares import Stacked, as_measured
 from bampipe.estimate.low_pass import Band
-from bampipe.estimate.standstill import find_runs
 from bampipe.physics import System
 from bampipe.results.filter import Disturbance
 from bampipe.trials.kept import MOST_OF_TRIALS, KeptItems
@@ -245,7 +244,7 @@ def part_trials(motions: Sequence[Motion], rate_hz: float) -> Sequence[Motion]:
         sound = np.ones(motion.t.size, dtype=bool)
         if motion.left_out is not None:
             sound = np.logical_not(motion.left_out.any(axis=1))
-        for start, end in find_runs(sound):
+        for start, end in zip(*find_runs(sound), strict=True):
             if end - start >= _SHORTEST_S * rate_hz or end - start == motion.t.size:
                 rows.append((number, slice(start, end)))
     if [part.stop - part.start for _, part in rows] == trial_sizes(motions):
@@ -317,7 +316,7 @@ def _candidates(mean_square: Array, whole: Array, blocks: _Blocks) -> list[tuple
     stretches = [
         (offset + start, offset + end)
         for offset, part in zip([0, *apart.tolist()], np.split(loud, apart), strict=True)
-        for start, end in find_runs(part)
+        for start, end in zip(*find_runs(part), strict=True)
     ]
     total, count, inside = size.sum(), int(known.sum()), 0
     found = []

@@ -15,6 +15,7 @@ from bampipe.arrays import Array, Indices
 from bampipe.estimate.least_squares import Stacked
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
+from bampipe.trials.linear_problem import solve_scaled
 from bampipe.trials.motion import Motion, trial_names
 from bampipe.trials.residuals import fit_device, rms
 
@@ -141,10 +142,7 @@ def _functions_of_motion(motion: Motion, band: Band) -> Array:
 
 def _fit(products: Array) -> Array:
     """Return the step that minimises the error, and 1, from products as in `_Trial.own`."""
-    size = 1.0 / np.sqrt(np.maximum(products.diagonal(), 1e-300))
-    scaled = products * size * size[:, None]
-    step = np.linalg.lstsq(scaled[:-1, :-1], -scaled[:-1, -1], rcond=1e-9)[0]
-    return np.append(step * size[:-1] / size[-1], 1.0)
+    return np.append(solve_scaled(products[:-1, :-1], -products[:-1, -1]), 1.0)
 
 
 def _beside_common_offset(trials: Sequence[_Trial], whole: Array) -> Array:

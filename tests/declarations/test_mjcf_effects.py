@@ -71,11 +71,8 @@ class Case:
                 self.p[i] = 1e-4 if motors else 0.1
             elif item.name in ("viscous_m2", "coulomb_m2"):
                 self.p[i] = 0.002 if "viscous" in item.name else 0.02
-        values = zip(self.system.parameters, self.p, strict=True)
-        write_result(
-            self.run.root, IdentifyResult,
-            parameters={q.name: {"estimate": float(v)} for q, v in values},
-        )  # fmt: skip
+        entries = {n: {"estimate": v} for n, v in self.system.by_name(self.p).items()}
+        write_result(self.run.root, IdentifyResult, parameters=entries)
         self.text = export_model(self.run, "base", "mjcf")
 
     def ours(self, torque: np.ndarray, late: tuple[float, ...] = (0.0, 0.0)) -> np.ndarray:

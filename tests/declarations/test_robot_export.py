@@ -139,7 +139,7 @@ def identify(folder: Path, files: dict[str, str]) -> Identified:
         short, _, name = item.name.rpartition(".")
         if short in INERTIAL_NAMES:
             p[i] = item.prior + (0.0 if item.fixed else balls[name][short])
-    entries = {q.name: {"estimate": float(v)} for q, v in zip(system.parameters, p, strict=True)}
+    entries = {name: {"estimate": value} for name, value in system.by_name(p).items()}
     write_result(run.root, IdentifyResult, parameters=entries)
     return Identified(run, system, p)
 
@@ -232,7 +232,7 @@ def test_mass_is_with_the_link_that_carries_it_or_beyond_a_joint_as_drawn(cell: 
         for e in ElementTree.fromstring(text).iterfind("link")
         if e.find("inertial") is not None
     }
-    value = {item.name: v for item, v in zip(cell.system.parameters, cell.p, strict=True)}
+    value = cell.system.by_name(cell.p)
     untouched = {"base plate": 5.0, "camera": 0.4, "hook": 0.3, "hook tip": 0.1, "left": 0.15}
     assert masses == {
         **untouched,

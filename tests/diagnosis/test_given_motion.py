@@ -19,6 +19,7 @@ from bampipe.physics.model_spec import ModelSpec
 from bampipe.physics.registry import device_from
 from bampipe.trials.linear_problem import pose_problem
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
+from bampipe.trials.replicates import keep_motion
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.scale import log_scale, slopes_by_force
 
@@ -38,6 +39,11 @@ def test_delays_shorter_than_the_true_one_promise_what_they_can_at_their_bounds(
     run = run_short(tmp_path / "logs", tmp_path, ("ingest", "filter"))
     spec = ModelSpec(device_from(tomllib.loads(prescribed.DEVICE)).declaration, (), ())
     trials = read_measured_trials(RunFolder(run.root), system_of(spec), every_input=True)
+    # Replicates keep the motion of a machine that another one moves, as its drive does not.
+    moved = tomllib.loads(prescribed.DEVICE.replace("drive =", "prescribed ="))
+    by_another = replace(spec, device=device_from(moved).declaration)
+    assert keep_motion(plain_trials(trials, by_another))
+    assert not keep_motion(plain_trials(trials, spec))
     session = Session(trials, Criteria())
     fit = fit_from_priors(session, spec)
     with open_search(session, fit, only=("actuator_delay",)) as search:

@@ -69,6 +69,9 @@ def test_what_a_model_may_be_wrong_by_weighs_less_where_the_force_is_large(fitte
     for force, root in zip(loose.applied, loose.root, strict=True):
         large, small = np.abs(force) > np.quantile(np.abs(force), [[0.9], [0.1]])
         assert root[large].mean() < 0.6 * root[~small].mean()
+    exact = Likelihood.of(fit.linearisation, like.samples, like.noise, 0.0, 0.0, force_sd)
+    for root, variance in zip(exact.root, like.noise.variance, strict=True):
+        np.testing.assert_allclose(root**2 * variance, 1.0)
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0, 1.4])
@@ -82,18 +85,22 @@ def test_what_all_replicates_share_goes_to_the_factor_of_the_bias(fitted, share)
     assert of_bias + of_stops == pytest.approx(np.full(3, share), abs=0.2)
 
 
-@pytest.mark.parametrize(("share", "found"), [(0.8, 0.8), (-0.7, 0.0), (4.0, 1.5)])
-def test_friction_that_truly_stops_has_a_factor_of_its_own_within_bounds(fitted, share, found):
+@pytest.mark.parametrize(
+    ("common", "share", "found"),
+    [(1.0, 0.8, (1.0, 0.8)), (-1.0, -0.7, (0.0, 0.0)), (4.0, 4.0, (1.5, 1.5))],
+)
+def test_friction_that_truly_stops_has_a_factor_of_its_own_within_bounds(
+    fitted, common, share, found
+):
     _, fit = fitted
     noise = fit.likelihood.noise
     # Unlike anything the model's own parameters could do.
     rng = np.random.default_rng(3)
     stops = tuple(np.abs(b).max() * rng.normal(size=b.shape) for b in noise.bias)
     like = replace(fit.likelihood, noise=replace(noise, stopping=stops))
-    residual = [b + share * s for b, s in zip(noise.bias, stops, strict=True)]
-    assert factors(replace(fit, likelihood=like), residual)[1] == pytest.approx(
-        np.full(3, found), abs=0.1
-    )
+    residual = [common * b + share * s for b, s in zip(noise.bias, stops, strict=True)]
+    solved = np.transpose(factors(replace(fit, likelihood=like), residual))
+    np.testing.assert_allclose(solved, [found] * 3, atol=0.1)
 
 
 def problem_of(y, base, *, independent=None, lower=-np.inf, upper=np.inf, absence=None):

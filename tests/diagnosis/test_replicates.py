@@ -176,6 +176,15 @@ def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values
     assert after < 0.01 * before
 
 
+def test_a_force_that_does_not_act_makes_no_replicate_out_of_the_measurement(fitted) -> None:
+    """It would lack all that the measurement lacks, which would then be taken for bias."""
+    trials, linearisation = fitted
+    system = compile_model(Model(linearisation.system.model.device, ["force_gain:current"]))
+    p = np.append(linearisation.p, 1.0)
+    with pytest.raises(replicates.Runaway, match="no force was found"):
+        replicates._required_force(ModelOnTrial(system, p, trials.motions), 500.0)
+
+
 @pytest.mark.parametrize(
     ("effect", "late"),
     [("force_delay", -0.006), ("actuator_delay", 0.006), ("actuator_lag:current", 0.0)],

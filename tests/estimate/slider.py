@@ -16,6 +16,8 @@ TRUTH = np.array([4.0, 1.1, 2.0])
 """Viscous N.s/m, Coulomb N, mass kg."""
 RESOLUTION = 2e-5
 FORCE_SD = 0.05
+BEND = 0.1
+"""Of the tachometer, s/m."""
 RATE = 500.0
 # Of processes that collect tests at once, one compiles what functions take as arguments.
 argument = partial(compiled.njit, cache=True, no_cfunc_wrapper=False)
@@ -30,7 +32,7 @@ def derivative(x, u, p, w, dx):
 @argument(MEASURE.signature)
 def measure(x, u, p, y):
     y[0] = x[0]
-    y[1] = x[1]
+    y[1] = x[1] + BEND * x[1] * x[1]
 
 
 @argument(DERIVATIVE_ROWS.signature)
@@ -45,7 +47,7 @@ def derivative_rows(count, x, u, p, w, dx):
 def measure_rows(count, x, u, p, y):
     for r in range(count):
         y[r] = x[r]
-        y[ROWS + r] = x[ROWS + r]
+        y[ROWS + r] = x[ROWS + r] + BEND * x[ROWS + r] * x[ROWS + r]
 
 
 def record(seed: int, seconds: float = 8.0, truth=TRUTH, resolution: float = RESOLUTION):
@@ -66,7 +68,7 @@ def record(seed: int, seconds: float = 8.0, truth=TRUTH, resolution: float = RES
     return Trial(
         t=t[::fine].copy(),
         u=noisy[:, None],
-        y=np.stack([counts, qd], axis=1),
+        y=np.stack([counts, qd + BEND * qd**2], axis=1),
         x=np.array([counts[0], 0.0]),
         x_sd=np.array([resolution, 0.1]),
     )

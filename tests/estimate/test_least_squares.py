@@ -197,6 +197,16 @@ def test_intervals_of_fewer_blocks_than_parameters_hold() -> None:
     assert np.max(off) < 4.0
 
 
+def test_neither_the_pull_of_a_prior_nor_what_it_fixes_is_scatter() -> None:
+    rng = np.random.default_rng(2)
+    x, left = np.ones((400, 1)), rng.normal(size=400)
+    blocks = [np.arange(400) // 20]
+    alone = covariance_by_blocks([(x, left)], np.zeros((1, 1)), blocks, [400.0])
+    beside, prior = np.hstack([x, rng.normal(size=(400, 1))]), np.diag([0.0, 1e12])
+    pulled = covariance_by_blocks([(beside, left + 0.5)], prior, blocks, [400.0])
+    assert pulled[0, 0] == pytest.approx(alone[0, 0])
+
+
 def _with(
     residual: Callable[[int, np.ndarray], np.ndarray], noise: list[np.ndarray]
 ) -> Callable[[int, np.ndarray], np.ndarray]:
@@ -312,10 +322,12 @@ def test_axes_that_count_unequally_and_disagree_are_weighed_to_rest() -> None:
         residual=lambda trial, p: force - p[0] * x,
         free=np.array([0]), lower=np.zeros(1), upper=np.full(1, 9.0), step=np.ones(1),
         band=Band(RATE, (8.0, 8.0)), standstill=[rest],
+        known=np.array([2.0]), precision=np.array([1e3]),
     )  # fmt: skip
     found = minimise(shared, np.array([5.0]))
+    assert found.cost < min(found.moved(found.p + step).cost for step in (-1e-3, 1e-3))
     few = minimise(shared, np.array([5.0]), most_iterations=10)
-    np.testing.assert_allclose(few.p, found.p, rtol=1e-6)
+    np.testing.assert_allclose(few.p, found.p, rtol=1e-5)
 
 
 def worst_second(found: Linearised, inner: Problem) -> tuple[RemovedStretch, np.ndarray]:

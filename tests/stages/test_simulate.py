@@ -267,7 +267,7 @@ def test_names_and_folders_that_no_session_can_have(tmp_path):
     with pytest.raises(InputError, match="cannot name a session"):
         simulate_session(tmp_path / "two words", Config())
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot make the folder"):
+    with pytest.raises(InputError, match="cannot write"):
         simulate_session(tmp_path / "file" / "inside", Config(duration=1.0))
     (tmp_path / "made").mkdir()
     (tmp_path / "made" / "precious.txt").write_text("x")

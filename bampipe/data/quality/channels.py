@@ -4,7 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bampipe.data.quality.table import TrialTable, find_runs, longest_run
+from bampipe.arrays import find_runs
+from bampipe.data.quality.table import TrialTable, longest_run
 from bampipe.data.session import SECONDS, Channel, Encoder, Register, Session
 from bampipe.data.session.channels import LARGEST_CONDITION
 from bampipe.data.units import unit

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.arrays import Array
-from bampipe.data.quality.table import TrialTable, find_runs, in_times, longest_run
+from bampipe.arrays import Array, find_runs
+from bampipe.data.quality.table import TrialTable, in_times, longest_run
 from bampipe.data.session import SECONDS
 from bampipe.lists import count_noun
 

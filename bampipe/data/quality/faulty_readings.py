@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bampipe.arrays import Array, Flags
+from bampipe.arrays import Array, Flags, find_runs
 from bampipe.data.angle_torque import SmoothedMotion, least_squares
 from bampipe.data.quality.channels import fill_missing, take_out
-from bampipe.data.quality.table import TrialTable, find_runs, longest_run
+from bampipe.data.quality.table import TrialTable, longest_run
 from bampipe.results.ingest import DeadStretch
 
 POSITION, INPUT = (0.95, 20.0), (0.5, 40.0)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.arrays import find_runs
 from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import Session, TrialEntry
 from bampipe.errors import InputError
@@ -138,12 +139,6 @@ class TrialTable:
         if wrong.any():
             at = int(np.argmax(wrong))
             raise self.fault(words(at), column=column, at=at, remedy=remedy)
-
-
-def find_runs(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First of every run of True in a (T,) mask, and the one after its last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
-    return edges[0::2], edges[1::2]
 
 
 def longest_run(which: np.ndarray) -> tuple[int, int]:

@@ -1,7 +1,5 @@
 """What a reader is asked for and what it returns, and the checks that all readers share."""
 
-from __future__ import annotations
-
 import gzip
 import importlib
 from collections.abc import Mapping, Sequence
@@ -92,7 +90,7 @@ class RawTrial:
             rows[sample:] += row - rows[sample] if sample < len(rows) else 0
         return rows
 
-    def between(self, start: int, stop: int) -> RawTrial:
+    def between(self, start: int, stop: int) -> "RawTrial":
         """The samples from ``start`` to before ``stop``."""
         return replace(
             self,

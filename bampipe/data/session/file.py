@@ -1,7 +1,5 @@
 """What a session file says: its channels, its trials, and where they lie; read and checked."""
 
-from __future__ import annotations
-
 import datetime
 import math
 import re
@@ -155,7 +153,7 @@ class TrialEntry(NamedDeclaration):
     hold_out: bool = Field(default=False, description="Never fitted, only for judging models")
     notes: str = Field(default="", description="Free text")
 
-    def overlaps(self, other: TrialEntry) -> bool:
+    def overlaps(self, other: "TrialEntry") -> bool:
         """Whether the stretches of two trials of one file have samples in common."""
         apart = self.recording != other.recording and None not in (self.recording, other.recording)
         apart |= self.columns != other.columns

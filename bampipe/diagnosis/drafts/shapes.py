@@ -14,7 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from bampipe.arrays import Array
-from bampipe.estimate.play import drag_along
+from bampipe.estimate.hysteresis import drag_along
 from bampipe.physics.expression import parse
 
 Constants = Mapping[str, Any]
@@ -100,7 +100,7 @@ def _slip(name: str, play: str) -> dict[str, Memory]:
     rate = f"(x - {name} - clip(x - {name}, -{play}, {play}))/settling"
 
     def course(x: Array, c: Constants) -> Array:
-        return np.asarray(drag_along(np.ascontiguousarray(x), np.array([float(c[play])])))[:, 0]
+        return np.asarray(drag_along(np.ascontiguousarray(x), float(c[play])))
 
     def quick_course(x: Array, c: Constants) -> Array:
         return np.asarray(np.maximum(x - c[play], x.min() + c[play]))

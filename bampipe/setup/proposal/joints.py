@@ -4,8 +4,6 @@ Columns that belong together have names alike but for the joint: its name, or a 
 with a column for every joint count, so no joint gets what is left over from another.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +31,7 @@ class Group:
     columns: tuple[SurveyedColumn, ...]
     named: bool
 
-    def reordered(self, order: Sequence[int]) -> Group:
+    def reordered(self, order: Sequence[int]) -> "Group":
         """The same columns as those of other joints: of each, the number of its column."""
         return replace(self, columns=tuple(self.columns[k] for k in order))
 
