@@ -43,7 +43,7 @@ _parent: multiprocessing.connection.Connection | None = None
 
 
 def send_to_parent(message: object) -> None:
-    """In a worker process: have what was passed to `process_pool` as ``hear`` called with it."""
+    """In a worker process: have the ``hear`` of `process_pool` called with ``message``."""
     if _parent is None:
         raise RuntimeError("this process was not started as a worker")
     _parent.send(_Message(message))

@@ -42,7 +42,7 @@ class SmoothedMotion:
 
     @classmethod
     def of(cls, t: Array, q: Array) -> "SmoothedMotion | None":
-        """Smooth a position ``q`` (T,) at ``t`` (T,), s; None where it is too short."""
+        """Smooth a position ``q`` (T,) at ``t`` (T,), s; None if it is too short."""
         step = float(np.median(np.diff(t)))
         width = max(5, round(_SMOOTHED_S / step) | 1)
         if len(t) < 4 * width + 20:

@@ -42,7 +42,7 @@ class Chain:
     Attributes:
         joints: by name, the entries of ``[robot.joints]``; limits: by name.
         notes: what was left out or joined, one sentence each.
-        gravity: in the base's frame, m/s2; None where it is not known.
+        gravity: in the base's frame, m/s2; None if it is not known.
         gravity_note: where that is from, or why it is not known, if that is not plain.
     """
 

@@ -18,7 +18,7 @@ from bampipe.files import read_toml
 
 _UNITS = {"revolute": ("rad", "N.m", "kg.m2"), "prismatic": ("m", "N", "kg")}
 _FRICTION_SHARE = 0.1
-"""Of the joint's largest effort: how much friction is thinkable before any data."""
+"""Share of the joint's largest effort that friction may take, before any data."""
 _EFFORT, _VELOCITY = 50.0, 3.0
 """Largest effort and velocity of a joint for which the URDF states none."""
 _DATA_SHEET = 0.2
@@ -28,7 +28,7 @@ _ACCELERATING_S = 0.02
 A joint whose drawn body has no inertia, as of many last links, moves by that of its drive."""
 
 _MOST_JOINTS = 32
-"""Of a chain: its equations grow with their square, and no drive of more is logged as one."""
+"""Most joints of a chain: equations grow with their square, and no machine logs more as one."""
 
 
 def read_device_file(path: Path) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
 
 
 def find_robot_file(path: Path) -> Path | None:
-    """The URDF or MJCF that a device file takes its joints from; None where there is none."""
+    """The URDF or MJCF from which a device file takes its joints; None if there is none."""
     robot = read_toml(path).get("robot")
     file = _robot_file(robot, str(path)) if isinstance(robot, Mapping) else None
     return path.parent / file if file is not None else None
@@ -140,7 +140,7 @@ def _frame_of_row(row: Mapping[str, Any]) -> tuple[Array, Array]:
 
 
 def _from_dh(rows: Mapping[str, Any]) -> dict[str, dict[str, Any]] | None:
-    """Joints of a table of Denavit and Hartenberg; None where a row is not well formed.
+    """Joints of a table of Denavit and Hartenberg; None if a row is not well formed.
 
     A row's frame lies behind its joint; joint and body are put where the motion is.
     """
@@ -192,7 +192,7 @@ def _filled(
     limits: Mapping[str, DriveLimits],
     motors: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """What the device file of a robot holds where it does not say otherwise.
+    """Defaults of the device file of a robot.
 
     Args:
         kinds: of the joints, by name; limits: of their drives.

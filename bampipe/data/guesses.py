@@ -1,4 +1,4 @@
-"""Guesses from the data themselves: units, rates, what a column is, and what drives what."""
+"""Guesses from the data themselves: units, rates, roles of columns, and drives of axes."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,10 +28,10 @@ _DATES = ((30_000.0, 80_000.0), (720_000.0, 760_000.0))
 _SPANS, _STEP = (0.5, 10.0 * np.pi), 0.01
 """Angles that a joint spans while it is logged, rad, and a step of their logarithm."""
 _WEIGHT_LEAVES, _SURE_TURNING = 0.5, 0.03
-"""Of what a straight line leaves of the drive, what a sine may leave, and the relative standard
-error up to which what a reading is worth is proposed."""
+"""Largest residual of a sine over that of a straight line, and the relative standard error up to
+which the scale of a reading is proposed."""
 _MOST_ROWS = 20_000
-"""Of which that is found."""
+"""Most rows that such guesses take."""
 _LEAST_SIGN_BIT, _SIGN_GAP = 7, 0.7
 """Lowest bit that is taken for a sign, and the largest magnitude, as a share of it, by which an
 empty range below the bit shows it."""
@@ -40,12 +40,12 @@ _NICE = (1, 1.2, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7.5, 8)
 _DERIVATIVE = 0.98
 """Correlation of a column with the integral of another, both without drift, to be that of it."""
 DRIVEN, _CLEAR = 0.5, 0.95
-"""Share of a column that the motion must explain for it to pass as what drives it."""
+"""Share of a column that the motion must explain for the column to pass as its drive."""
 MOVED, CLEARLY = 0.8, 0.5
 """Of two columns, the share of one that the motion of the other must explain, and how much less it
 may leave than the other way round."""
 _STEADY = 50.0
-"""Of the median step: the longest one of a time."""
+"""Longest step of a column of times, in median steps."""
 _COPIED = 1e-3
 """Residual of a column regressed on a copy of it, over its standard deviation: rounding alone."""
 MOST_IN_TURN, _GOES_ON, _LEAPS = 64, 0.2, 0.4
@@ -57,7 +57,7 @@ next, over that from row to row, the most; the latter, squared, over twice the v
 def time_unit(t: np.ndarray, said: str) -> str:
     """Unit of a time column: as said, else the one that gives a rate at which motion is logged.
 
-    "" where it counts something else, such as ticks, or no unit gives such a rate.
+    "" if it counts something else, such as ticks, or no unit gives such a rate.
     """
     known = said if said == "datetime" else spelled(said, tuple(SECONDS))
     if said and known in (*SECONDS, "datetime", ""):
@@ -96,7 +96,7 @@ def sample_rate(t: np.ndarray) -> float:
 
 
 def follows(first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether ``second`` does what ``first`` did a little earlier, as a machine its reference."""
+    """Whether ``second`` follows ``first`` a little later, as a machine does its reference."""
     slope = 0.5 * (np.gradient(first) + np.gradient(second))
     return float((first - second) @ slope) > 0.0
 
@@ -126,13 +126,13 @@ def take_turns(values: np.ndarray, keys: Sequence[np.ndarray]) -> bool:
 
 @dataclass(frozen=True)
 class Driven:
-    """How a column goes with the motion of an axis, by least squares on one log.
+    """Dependence of a column on the motion of an axis, by least squares on one log.
 
     Attributes:
         share: part of its variance that acceleration, velocity, its sign and position explain,
             0 to 1; a force, a current or a voltage that moves a mass with friction has much.
-        inertia, viscous, coulomb: what multiplies acceleration, velocity and its sign.
-        pose: what follows the position where that is an angle; None where it is none.
+        inertia, viscous, coulomb: coefficients of acceleration, velocity and its sign.
+        pose: the part that follows the position, if that is an angle; otherwise None.
     """
 
     share: float
@@ -175,7 +175,7 @@ def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False
 
 @dataclass(frozen=True)
 class Turning:
-    """What readings of a position are worth, by the weight that goes with the sine of the angle.
+    """Scale of the readings of a position, by the weight that goes with the sine of the angle.
 
     Attributes:
         size: raw units of one radian of the joint; sd: its standard error.
@@ -194,7 +194,7 @@ def find_turning(t: np.ndarray, q: np.ndarray, drive: np.ndarray) -> Turning | N
         t: (T,) s; q: (T,) position in counts, or of a motor before its gear; drive: (T,).
 
     Returns:
-        None where weight does not show it, or not to a few per cent.
+        None if weight does not show it, or not to a few per cent.
     """
     motion = SmoothedMotion.of(t, q)
     if motion is None or np.ptp(q) == 0.0:
@@ -212,7 +212,7 @@ def find_turning(t: np.ndarray, q: np.ndarray, drive: np.ndarray) -> Turning | N
         rest = fitted(x)[1]
         return float(rest @ rest)
 
-    # What an angle spans, by its logarithm: from half a radian to five turns.
+    # The travel of the joint, by its logarithm: from half a radian to five turns.
     tried = np.linspace(math.log(_SPANS[0]), math.log(_SPANS[1]), 110)
     costs = [left(x) for x in tried]
     best = int(np.argmin(costs))
@@ -236,7 +236,7 @@ def find_turning(t: np.ndarray, q: np.ndarray, drive: np.ndarray) -> Turning | N
 
 
 def find_register(values: np.ndarray) -> Register | None:
-    """How an unsigned register holds its sign, None where it holds none.
+    """Form in which an unsigned register holds its sign, None if it holds none.
 
     Two's complement leaves the middle of the range empty, sign and magnitude the upper part of
     either half. In both the readings leap where the number crosses 0, and not once they are signed.
@@ -261,7 +261,7 @@ def find_register(values: np.ndarray) -> Register | None:
 
 
 def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:
-    """Where to cut one record, (T,) positions at (T,) s from 0: at rests near even spacing, s."""
+    """Times, s, at which to cut a record, (T,) positions at (T,) s from 0: rests evenly spaced."""
     parts = min(5, int(t[-1] // 4.0))
     if parts < 2:
         return []
@@ -275,9 +275,9 @@ def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:
 
 
 def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
-    """Roles of columns (T,) by what they look like, those that look like nothing left out.
+    """Roles of columns (T,) by their looks; those that look like nothing are left out.
 
-    ``t``: (T,) time, None where no column is known to be one. Roles are "time", "position",
+    ``t``: (T,) time, None if no column is known to be one. Roles are "time", "position",
     "velocity", "acceleration" or "force" (what drives the motion).
     """
     found: dict[str, str] = {}
@@ -325,7 +325,7 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
 
 
 def describe(name: str, values: Array) -> str:
-    """What is seen of a column, for a person who knows what was logged."""
+    """Describe the numbers of a column to a person who knows what was logged."""
     known = values[np.isfinite(values)]
     if is_time(known):
         return f"{name} increases as a time does"
@@ -346,14 +346,14 @@ def _derivatives(matrix: Array, t: Array) -> dict[int, int]:
     """
     since = t - t[0]
     integrals = cumulative_trapezoid(matrix, since, axis=0, initial=0.0)
-    # Nor a parabola: what warms up would be the integral of whatever drifts.
+    # Without a parabola, too: a warming signal would be the integral of any that drifts.
     base, _ = np.linalg.qr(np.column_stack([np.ones_like(since), since, since**2]))
     p, i = (each - base @ (base.T @ each) for each in (matrix, integrals))
     size = np.outer(np.linalg.norm(p, axis=0), np.linalg.norm(i, axis=0))
     alike = np.divide(p.T @ i, size, out=np.zeros_like(size), where=size > 0.0)
     np.fill_diagonal(alike, 0.0)
     found: dict[int, int] = {}
-    # Of columns that repeat each other the first, whatever the rounding.
+    # If columns repeat each other, the first one counts, whatever the rounding.
     order = np.argsort(-np.round(alike, 9), axis=None, kind="stable")
     for k, rate in zip(*np.unravel_index(order, alike.shape), strict=True):
         if alike[k, rate] < _DERIVATIVE:

@@ -9,14 +9,14 @@ from bampipe.data.units import unit
 from bampipe.data.vocabulary import VOCABULARY, word_set
 
 DRIVERS = ("force", "current", "voltage")
-"""Roles of what may drive an axis."""
+"""Roles of columns that may drive an axis."""
 _ROLE_WORDS: Mapping[str, str] = VOCABULARY["roles"]
 _PLAIN = str.maketrans({"ı": "i", "ł": "l", "Ł": "L", "ø": "o", "ß": "ss", "µ": "u", "μ": "u"})
 _ALL_WORDS = frozenset(word for text in _ROLE_WORDS.values() for word in text.split())
 _ENDS = sorted((word for word in _ALL_WORDS if len(word) > 4 or word in ("time", "zeit")), key=len)
 _RUN_TOGETHER = re.compile(r"(q|dq|tau|trq|pos|vel)(des|ref|cmd|meas|msr|act)")
 REFERENCE_WORDS = frozenset(_ROLE_WORDS["reference"].split())
-"""Words for what a controller asks for rather than what was measured."""
+"""Words for the references of a controller rather than measurements."""
 _BY_UNIT: Mapping[str, str] = VOCABULARY["roles_by_unit"]
 _VAGUE, _TERSE, _WORDY = map(word_set, ("vague", "terse", "wordy"))
 _PLAIN_POSITIONS, _PRESENT, _ANGLES = map(word_set, ("plain", "present", "angles"))
@@ -28,7 +28,7 @@ FACTOR = re.compile(
     r"(?i)(?:\s?[*×]\s?|[_ .(]+(?:x ?|(?:div|by|times)[_ ]?|(?=1?e\d\Z|10+0\Z)))"
     r"(?:1?e\d|10+|\d{3,})(?![a-z\d.])"
 )
-"""In a name, what its unit is multiplied by, or its numbers are."""
+"""Factor in a name, of its unit or of its numbers."""
 _UNIT_WORDS: Mapping[str, list[str]] = {
     role: text.split() for role, text in VOCABULARY["units_in_names"].items()
 }

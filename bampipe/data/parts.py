@@ -26,7 +26,7 @@ _AXIS = re.compile(r"(?i)(?<![a-z])(joint|axis|link|servo|motor|dof|j)[ _-]?(\d+
 _LONGEST = 40
 """Letters in the name of a part."""
 _SAME_STAMP = 0.6
-"""Of a step: how far stamps of two clocks of the same samples may be apart."""
+"""Share of a step by which two clocks may stamp the same samples differently."""
 _OVERLAP = 0.5
 """Share of the shorter part that both must have in common on one clock."""
 _TOO_FEW = 100
@@ -40,7 +40,7 @@ class FileClock:
     """The time of one file.
 
     Attributes:
-        samples: how many it has; column: its time column, "" where there is none; unit: of that.
+        samples: how many it has; column: its time column, "" if there is none; unit: of that.
         t: (T,) s; start: its first stamp, s, on a clock that files may share.
     """
 
@@ -142,7 +142,7 @@ def _called(words: Iterable[str]) -> str:
 
 
 def _part(main: str, other: str, called: str, first: FileClock, second: FileClock) -> Part:
-    """How ``other`` is joined to ``main``; InputError where neither length nor clock says how."""
+    """Choose the join of ``other`` to ``main``; InputError if neither length nor clock shows it."""
     counts = sorted((first.samples, second.samples))
     rows = counts[1] - counts[0] <= max(1, MOST_APART * counts[1])
     join: Literal["rows", "time", "start", ""] = "rows" if rows else ""

@@ -21,15 +21,15 @@ MOST_APART = 0.01
 _LEAST = 20
 """Samples of a recording: time that falls sooner has not started again."""
 _MOSTLY = 0.95
-"""Share of rows in which a column that is of the same rows has a reading."""
+"""Least share of rows in which a column sampled with the others has a reading."""
 _LOST = 5.0
-"""Of the usual step between readings: a longer one has lost some."""
+"""Multiple of the usual step between readings beyond which some are lost."""
 _FAR_OFF = 10.0
-"""Of the range of all other readings: how far off one that recurs is no reading."""
+"""Distance of a recurring value, in ranges of all other readings, beyond which it is no reading."""
 _PAGE = 3.0
 """Steps that a clock goes on by where the header stands again on a new page."""
 _BACK = 0.02
-"""Of the time that has passed: how close to its beginning a clock that starts again comes."""
+"""Largest share of the time passed to which a clock that starts again falls back."""
 
 
 def read_recording(
@@ -177,13 +177,13 @@ def starts_of(raw: RawTrial, clock: str) -> list[int]:
     starts = {0, *raw.begun}
     t = raw.columns.get(clock)
     if t is not None:
-        # Where time goes on across a header, it is that of a page.
+        # If time goes on across a header, that is the header of a page.
         ahead = {at: float(t[at] - t[at - 1]) for at in raw.begun}
         usual = float(np.nanmedian(np.diff(t))) if len(t) > 1 else 0.0
         starts -= {at for at, step in ahead.items() if 0.0 < step < _PAGE * usual}
         begin, rolled = 0, unroll(t)[2]
         moving = [values for name, values in raw.columns.items() if name != clock]
-        # Where a counter merely rolls over, the signals continue.
+        # If a counter merely rolls over, the signals continue.
         rolls = bool(len(rolled)) and all(goes_on(values, rolled) for values in moving)
         for at in () if rolls else np.flatnonzero(np.diff(t) < 0.0) + 1:
             begin = max([start for start in starts if start <= at], default=begin)

@@ -16,7 +16,7 @@ _BELOW_ZERO = 1e-6
 DEEPEST = 200
 """Most links one behind another."""
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
-"""Kinds of joint that a chain moves by, and what a device file calls them."""
+"""Kinds of joint that move a chain, and their names in a device file."""
 UPRIGHT = (0.0, 0.0, -9.81)
 """Gravity where nothing else is said, m/s2."""
 _ROUNDING = 1e-6
@@ -110,7 +110,7 @@ class TreeJoint:
         axis: in its own frame.
         limits: of its drive.
         mimic: the joint that it follows, its motion for one of that, and its position where that
-            is at zero, rad or m; None where it moves by itself.
+            is at zero, rad or m; None if it moves by itself.
     """
 
     name: str
@@ -133,7 +133,7 @@ class Tree:
         bodies: by link, in its frame.
         joints: from a link to one behind it.
         notes: what of the file is not heard, one sentence each.
-        gravity: in the frame of the link at the root, m/s2; None where the file says nothing.
+        gravity: in the frame of the link at the root, m/s2; None if the file says nothing.
     """
 
     bodies: Mapping[str, Body]
@@ -185,7 +185,7 @@ class Tree:
 def gravity_at(tree: Tree, base: str) -> tuple[tuple[float, float, float] | None, str]:
     """Gravity in the frame of a link, m/s2, and a clause where joints on the way to it turn it.
 
-    The root of a URDF stands upright. None where that goes for the link as well, or where a joint
+    The root of a URDF stands upright. None if that goes for the link as well, or if a joint
     above it can tilt it.
     """
     way = tree.way(base)

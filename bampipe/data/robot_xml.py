@@ -15,7 +15,7 @@ _MEND = "mend it, or take it out of the folder"
 DEEPEST = 200
 """Most elements inside one another."""
 Attribute = str | float | Iterable[float]
-"""Of an element: text, a number or several."""
+"""Attribute of an element: text, a number or several."""
 
 
 def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:

@@ -14,7 +14,7 @@ R = TypeVar("R", bound="Result")
 
 INGESTED = ("ingest/trials.parquet", "ingest/samples.parquet", "ingest/session.json")
 FILTERED = ("filter/kinematics.parquet", "filter/filter.json")
-"""What the stages ingest and filter leave for others."""
+"""Files that the stages ingest and filter leave for others."""
 MOVING = ("free", "viscous")
 """Kinds of trial in which the arm moves; only with commanded brakes do effects of brakes show."""
 
@@ -58,7 +58,7 @@ class RunFolder:
         return MissingResultError(f"{relative} is missing", where=str(self.root), remedy=remedy)
 
     def model_option(self, model: str) -> str:
-        """Return `` --model`` with a model; "" where the run has no other."""
+        """Return `` --model`` with a model; "" if the run has no other."""
         return f" --model {model}" if {*self.models()} - {model} else ""
 
     def read(self, kind: type[R], model: str = "") -> R:
@@ -70,7 +70,7 @@ class RunFolder:
         return kind.read(self.require(kind.file(model), kind.STAGE))
 
     def find(self, kind: type[R], model: str = "") -> R | None:
-        """Return the result as `read` does; None where its stage has not run."""
+        """Return the result as `read` does; None if its stage has not run."""
         return self.read(kind, model) if self.exists(kind.file(model)) else None
 
     def models(self, file: str = "model.toml") -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The rate of samples where no column has their time: what a file, or one beside it, says of it."""
+"""The sample rate if no column is a time: as stated by the file, or by one beside it."""
 
 import re
 from collections.abc import Collection, Iterator
@@ -13,9 +13,9 @@ from bampipe.data.units import unit
 from bampipe.data.vocabulary import word_set
 
 _SMALL = 1 << 16
-"""Bytes of what is written about logs, the most."""
+"""Largest text about logs that is read, bytes."""
 _NOTES = word_set("notes")
-"""File extensions of what is written about logs."""
+"""File extensions of texts about logs."""
 _STATEMENT = re.compile(
     r"(?P<name>[A-Za-z][\w .-]*?)\s*(?:[\[(](?P<of>[^\])\d]*)[\])])?"
     r"[\"']?\s*[=:;,\t ]{1,3}\s*[\"']?"
@@ -63,7 +63,7 @@ def intervals_stated(folder: Path, logs: Collection[str]) -> dict[str, float]:
 def units_stated(
     folder: Path, logs: Collection[str], names: Collection[str]
 ) -> dict[str, tuple[str, str]]:
-    """Units of columns by what is written beside ``logs`` (``torque: N mm``), and in which file.
+    """Units of columns stated by texts beside ``logs`` (``torque: N mm``), and the file.
 
     A line begins with the name of the column, or has it in quotes. Units that contradict one
     another, or the name, are left out.

@@ -12,17 +12,17 @@ from bampipe.data.session import Session
 from bampipe.errors import InputError
 
 PORTION = 1 << 16
-"""Bytes read at once: what memory is bounded by, with `LONGEST_LINE`."""
+"""Bytes read at once, which bound the memory together with `LONGEST_LINE`."""
 LONGEST_LINE = 1 << 20
 DELIMITERS = ",;\t"
 LARGEST = 1e15
-"""No time, position or force in SI units is larger: what is, came of a fault."""
+"""No time, position or force in SI units is larger, except by a fault."""
 MOST_COMPLAINTS = 3
 
 
 @dataclass(frozen=True)
 class StreamLayout:
-    """What the columns of a stream mean: SI values = raw @ gain + offset, time first.
+    """Meaning of the columns of a stream: SI values = raw @ gain + offset, time first.
 
     Attributes:
         columns: (k,) columns needed, the time first.
@@ -116,12 +116,12 @@ class SampleStream:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the columns of `read` are; empty before the header has come."""
+        """Names of the columns of `read`; empty before the header has come."""
         return self._layout.names if self._layout else ()
 
     @property
     def lines_without_sample(self) -> int:
-        """How many lines have come since the last one that held a sample."""
+        """Number of lines since the last one that held a sample."""
         return self._line - self._last_good
 
     def read(self, last: bool = False) -> Array:

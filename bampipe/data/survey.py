@@ -1,4 +1,4 @@
-"""What a folder of logs holds, before anyone has said what its columns mean."""
+"""Survey of a folder of logs, before anyone has said what its columns mean."""
 
 import re
 from collections import Counter
@@ -53,10 +53,10 @@ class SurveyedColumn:
 
     Attributes:
         name: as the reader calls it.
-        stated: unit that the file gives, "" where it gives none.
+        stated: unit that the file gives, "" if it gives none.
         role: time, position, velocity, acceleration, force, current, voltage, brake, reference,
             or "".
-        unit: unit by the file, else by the name, "" where neither says.
+        unit: unit by the file, else by the name, "" if neither says.
         values: (T,) of the first log.
         by_looks: whether its name says nothing and its role is what it looks like.
     """
@@ -70,12 +70,12 @@ class SurveyedColumn:
 
     @property
     def conversion(self) -> RecordedUnit | None:
-        """How its unit becomes SI; None where it has none, or none that is known."""
+        """Conversion of its unit to SI; None if it has no known unit."""
         return unit(self.unit) if self.unit else None
 
     @property
     def si(self) -> str | None:
-        """SI unit of its quantity; None where that is not known."""
+        """SI unit of its quantity; None if that is unknown."""
         return self.conversion.si if self.conversion is not None else None
 
     @property
@@ -211,7 +211,7 @@ class _Logs:
         return paths
 
     def look_through(self, paths: Sequence[Path]) -> None:
-        """Find the columns of every file; what is no log is left out, with the reason."""
+        """Find the columns of every file; files that are no logs are left out, with the reason."""
         for path in paths:
             name = path.relative_to(self.folder).as_posix()
             try:
@@ -251,8 +251,8 @@ class _Logs:
         )
 
     def fault(self) -> InputError:
-        """That no log can be read, with the reason of the first."""
-        # What is no log anyway says least.
+        """Error that no log can be read, with the reason of the first."""
+        # The reasons of files that are no logs say least.
         idle = ("*", "no table", "one row", "other columns")
         name, why = min(
             self.passed,
@@ -400,7 +400,7 @@ class _Logs:
             column = (moments or times)[0]
             said = "datetime" if moments else spelled(labels[column], CLOCK_UNITS)
             clock = Clock(column=column, unit=next((u for u in CLOCK_UNITS if u == said), "s"))
-        # Of several rates, that of the positions counts.
+        # If there are several rates, that of the positions counts.
         first = sorted(ordered, key=lambda c: (c not in times, role_of(c, labels[c]) != "position"))
         raw = read_recording(self.folder, trial, first, clock, self.dialect)
         self.beside = {
@@ -426,7 +426,7 @@ class _Logs:
             said = raw.units.get(column, labels[column])
             role = role_of(column, said)
             if role and clock.column != column and re.search(r":column_\d+$|\[0\]$", column):
-                # Of files without a header or a matrix, named for what the rest of it is.
+                # A column without a header, or of a matrix, may be named after the others.
                 role = "time" if is_time(raw.columns[column][sound]) else role
             unit = unit_of(column, said, role)
             factor = FACTOR.search(column)

@@ -1,4 +1,4 @@
-"""Units that logs are written in, and what makes coherent SI units of them."""
+"""Units of logs, and their conversion to coherent SI units."""
 
 import re
 from collections import Counter
@@ -12,7 +12,7 @@ from bampipe.data.vocabulary import VOCABULARY, by_word
 
 @dataclass(frozen=True)
 class RecordedUnit:
-    """How a unit becomes SI: value in ``si`` = scale * value + offset."""
+    """Conversion of a unit to SI: value in ``si`` = scale * value + offset."""
 
     si: str
     scale: float = 1.0
@@ -21,14 +21,14 @@ class RecordedUnit:
 
 _GRAVITY = 9.80665
 _ORDER = ("kg", "N", "W", "Pa", "V", "A", "T", "K", "Hz", "rad", "m", "s")
-"""In which SI units stand in a product."""
+"""Order of SI units in a product."""
 _FACTORS: dict[str, tuple[str, float]] = {
     name: next(iter(of.items()))
     for name, of in ({si: {si: 1.0} for si in _ORDER} | VOCABULARY["units"]).items()
 }
 """Units that others are put together from, with their SI unit."""
 _LOGGED = frozenset(["", *_ORDER, "N.m", "rad/s", "rad/s2", "m/s", "m/s2"])
-"""SI units of what is logged."""
+"""SI units of logged quantities."""
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "da": 10.0, "k": 1e3, "M": 1e6}
 _PREFIXED = frozenset(["s", "m", "rad", "deg", "N", "A", "V", "W", "Hz", "Pa", "T", "g", "bar"])
 _WHOLE = by_word("whole_units")
@@ -40,7 +40,7 @@ _NAME_WITH_UNIT = re.compile(
     r"(?P<name>.*?)(?:\s*(?P<open>[\[(])\s*|\s/\s)(?P<unit>[^\[\]()]{1,16}?)\s*(?(open)[\])])\Z"
 )
 SCALES = ("scale", "scaling", "factor", "lsb", "gain")
-"""What a file calls the number that readings are to be multiplied by, beside them."""
+"""Names in files for the number by which readings are to be multiplied."""
 _BESIDE = re.compile(r"(?i)(?:\A|(?<=[./]))units?[./]|(?:\A|[ _./])units?\Z")
 """Affix that marks a metadata field as the unit of a quantity: the rest names the quantity."""
 _INDEX = re.compile(r"\d+|0x[0-9A-Fa-f]+|\d[0-9A-Fa-f]{3}h")
@@ -56,7 +56,7 @@ _TOKEN = re.compile(
 def spelled(text: str, among: Sequence[str]) -> str:
     """The one of ``among`` that means the same unit as ``text``, else the text without brackets.
 
-    "" where the unit is not known.
+    "" if the unit is not known.
     """
     known = unit(text)
     if text in among or known is None:
@@ -86,7 +86,7 @@ def units_in(names: Iterable[str]) -> dict[str, str]:
 
     matches = {n: m for n, m in matches.items() if m["name"] and (m["open"] or unit(m["unit"]))}
     units = {n: m["unit"] for n, m in matches.items() if not is_index(m)}
-    # Where all is in capitals, M and S are no names.
+    # In a name all in capitals, M and S are metres and seconds, too.
     return {n: u.lower() if n.isupper() and u in ("M", "S") else u for n, u in units.items()}
 
 
@@ -112,7 +112,7 @@ def in_steps(values: np.ndarray, sizes: Collection[float], text: str, sure: bool
 
 
 def unit(text: str) -> RecordedUnit | None:
-    """What ``text`` stands for, None where that is not known.
+    """The unit that ``text`` stands for, None if it is unknown.
 
     It is a product of factors with powers, in any of the usual spellings: ``Nm``, ``N*m``,
     ``N·m`` and ``N-m`` are the same, ``mA``, ``kN`` and the like are put together from their

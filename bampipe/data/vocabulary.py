@@ -14,5 +14,5 @@ def word_set(name: str) -> frozenset[str]:
 
 
 def by_word(table: str) -> dict[str, str]:
-    """By each word of a table what it stands for."""
+    """Meaning of each word of a table."""
     return {word: key for key, text in VOCABULARY[table].items() for word in text.split()}

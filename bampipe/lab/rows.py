@@ -1,4 +1,4 @@
-"""From one run folder to its rows in the tables of the lab."""
+"""Rows of one run folder in the tables of the lab."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

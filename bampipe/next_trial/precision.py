@@ -155,19 +155,12 @@ class Precision:
         determined = max(float(by_data.sum()), 1.0)
         wide = _NORMAL_80 * np.sqrt(trust * chance + chance / determined + 0.5 / informative)
 
-        def noise(widening: Array | float) -> Array:
+        def sd(widening: Array | float, at_least: Array | float = least) -> Array:
             data = np.exp(scatter) * self._widen_for_few(self.blocks + new) * widening
-            return np.asarray(least * np.sqrt(by_data_then * data**2 + (1.0 - by_data_then)))
+            size = least * np.sqrt(by_data_then * data**2 + (1.0 - by_data_then))
+            return np.asarray(np.hypot(np.maximum(size, at_least), self.irreducible_sd))
 
-        low, median, high = (
-            np.hypot(size, self.irreducible_sd)
-            for size in (
-                noise(np.exp(-wide)),
-                np.maximum(noise(1.0), least),
-                np.maximum(noise(np.exp(wide)), least),
-            )
-        )
-        return Expected(low, median, high)
+        return Expected(low=sd(np.exp(-wide), 0.0), median=sd(1.0), high=sd(np.exp(wide)))
 
     def _split_variance(self, information: Array) -> tuple[Array, Array]:
         """Return variances of the parameters, (n,), and the share of each that is due to trials."""

@@ -85,10 +85,7 @@ class Envelope:
         """Return the envelope of the trials at hand, for a model with parameters ``p`` (n_p,)."""
         device = system.model.device
         axes = [c.name for c in device.coordinates]
-        q, qd, qdd = (
-            np.concatenate([getattr(motion, name) for motion in motions])
-            for name in ("q", "qd", "qdd")
-        )
+        q, qd, qdd = map(np.concatenate, zip(*(m.kinematics for m in motions), strict=True))
         bounds = np.array([device.limits.get(axis, (-np.inf, np.inf)) for axis in axes])
         low = np.maximum(np.quantile(q, 0.01, axis=0), bounds[:, 0])
         high = np.minimum(np.quantile(q, 0.99, axis=0), bounds[:, 1])

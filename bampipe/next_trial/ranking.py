@@ -145,14 +145,10 @@ def rank_designs(
         progress(0.75 + 0.25 * k / finalists, "simulating people who follow the best ones roughly")
         motions = space.follow(design)
         ranked.append(RankedDesign(design, _take_low([utility(m) for m in motions]), motions))
-    best_utility = max(one.utility for one in ranked)
-    enough = best_utility - _PREMIUM_BEYOND * abs(best_utility)
-
-    def order(one: RankedDesign) -> tuple[bool, float]:
-        return one.utility < enough or space.goes_beyond(one.design), -one.utility
-
     ranked.sort(key=lambda one: -one.utility)
-    first = min(ranked, key=order)
+    most = ranked[0].utility
+    good = (one for one in ranked if one.utility >= most - _PREMIUM_BEYOND * abs(most))
+    first = next((one for one in good if not space.goes_beyond(one.design)), ranked[0])
     return [first, *(one for one in ranked if one is not first)]
 
 

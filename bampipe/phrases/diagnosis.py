@@ -87,7 +87,7 @@ def split_alternatives(
         first: a word before the first probability of each part.
 
     Returns:
-        ``a:yaw (0.99)``, or "" where there is none; ``b:yaw (0.60)``, ``nothing more (0.40)``.
+        ``a:yaw (0.99)``, or "" if there is none; ``b:yaw (0.60)``, ``nothing more (0.40)``.
     """
     common, sets = split_sets(found, axis)
     entry, parts = found.axes[axis], list[str]()

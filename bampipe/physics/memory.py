@@ -20,7 +20,7 @@ STIFF_STEPS = (3, 24)
 the fewer unless the more differ. The error of a hysteresis passed 300 times between two samples is
 at most 0.6 % at a reversal, 60 times 0.06 %."""
 TOLERANCE = 3e-4
-"""Of the largest value of a state: by how much they may differ."""
+"""Share of the largest value of a state by which the two may differ."""
 _STEP_AGAINST_NEIGHBOURS = 8.0
 """A command that changes between two samples this many times more than before and after has been
 switched. Ramps and sines change by at most twice as much from one sample to the next; noise of the

@@ -1,4 +1,4 @@
-"""From a run folder to the report's files."""
+"""Building of the report's files from a run folder."""
 
 import importlib
 from collections.abc import Callable

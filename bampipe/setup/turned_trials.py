@@ -63,7 +63,7 @@ def find_turned_trials(
     gains = {k: np.array([gain(stated[k], one) for one in of]) for k, of in fits.items()}
     found: dict[int, list[tuple[float, int]]] = {}
     for place in range(len(options)):
-        # Of the signs that explain a trial, the best one, and those that are as good.
+        # The best sign for each trial, and those that are as good.
         against = [k for k, of in gains.items() if of[place] > max(LEAST_GAIN, of.max() - ALIKE)]
         along = [k for k, of in gains.items() if of[place] < -LEAST_GAIN]
         for k in min(against, along, key=len) if against and along else ():

@@ -51,8 +51,8 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 from bampipe.trials.motion import trial_names
 from bampipe.trials.reading import read_band, read_kinematics, read_motions, read_sensors
+from bampipe.trials.residuals import find_robot_timing
 from bampipe.trials.soundness import require_sound
-from bampipe.trials.timing import find_robot_timing
 
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
 INPUTS = (*INGESTED, *FILTERED, *MODEL_INPUTS)

@@ -241,7 +241,7 @@ def _required_force(fitted: ModelOnTrial, rate_hz: float) -> Array:
         q, qd = motion.q + by * motion.qd + 0.5 * by**2 * motion.qdd, motion.qd + by * motion.qdd
         at_samples = replace(motion, q=q, qd=qd).with_channels({STAMP_OFFSET: 0.0 * offset})
         force = _required_force(ModelOnTrial(system, fitted.p, [at_samples]), rate_hz)
-        # Of points of the grid that share a sample, the nearest counts.
+        # If points of the grid share a sample, the nearest one counts.
         order = np.argsort(np.abs(offset), kind="stable")
         stamps, first = np.unique(np.round(motion.t + offset, 9)[order], return_index=True)
         grid = UniformGrid(motion.t, np.zeros(len(offset), dtype=bool), False, stamps)

@@ -11,8 +11,7 @@ from bampipe.physics import Model, System, compile_model
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.physics.registry import device_from
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import ModelOnTrial
-from bampipe.trials.timing import find_robot_timing
+from bampipe.trials.residuals import ModelOnTrial, find_robot_timing
 from tests.physics.small_arm import ARM
 
 RATE = 250.0

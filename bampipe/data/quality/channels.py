@@ -44,7 +44,7 @@ def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
 
 
 def fill_missing(table: TrialTable) -> None:
-    """Interpolate missing samples, drop them at the ends; what a long run spans is left out."""
+    """Interpolate missing samples, drop them at the ends; long runs are left out."""
     channels = [name for name in table.columns if name != table.clock]
     unknown = {name: ~np.isfinite(table.columns[name]) for name in channels}
     some = np.logical_or.reduce([*unknown.values()])

@@ -17,27 +17,27 @@ _PERIODS = (
     *(("midnight", unit * 86_400.0) for unit in (1.0, 1e3, 1e6, 1e9)),
     *(("a full second", unit) for unit in (1.0, 1e3, 1e6, 1e9)),
 )
-"""Where clocks roll over, and after how much, by what stamps may have been multiplied by."""
+"""Names and periods at which clocks roll over, by the factors stamps may be multiplied by."""
 _NEAR_ROLL = 5.0
 """Steps within which a stamp that rolled over goes on where the one before stopped."""
 _OF_ONE_LATTICE = 1e-3
-"""Of the mean step: what may be a rounding of numbers in the file."""
+"""Share of the mean step up to which a deviation may be a rounding of numbers in the file."""
 _UNEVEN = 0.05
-"""Share of the steps that rounding makes unlike the others, the least."""
+"""Least share of the steps that rounding makes unlike the others."""
 _LEAST_HELD = 0.15
-"""Share of rows that are held, the least."""
+"""Least share of rows that are held."""
 _REGULAR = 0.7
-"""Share of the intervals between new readings that are as long as their median, the least."""
+"""Least share of the intervals between new readings that are as long as their median."""
 _NO_COUNT = 5.0
 """Median change of a new reading over the least: what is held at regular intervals and then changes
 by one count is an encoder that moves slowly."""
 LONGEST_TRIAL_S = 3.2e7
-"""A year: what is longer was not recorded in one go, and the unit of its clock is wrong."""
+"""A year: no longer trial is recorded in one go, so the unit of its clock is wrong."""
 _GAP = 1.6
-"""Of the median step, beyond which samples are missing."""
+"""Multiple of the median step beyond which samples are missing."""
 _SMOOTHER = 0.8
-"""Of the travel of the positions in the order of the file, in that of the stamps: below, rows were
-written late; above, the clock was set back."""
+"""Travel of the positions in the order of the stamps, over that in the order of the file: below,
+rows were written late; above, the clock was set back."""
 _UNLIKELY_TWICE = 0.1
 """Share of stamps that stand twice once rows are sorted, from which two recordings are mixed."""
 _SEAM = 3.0
@@ -88,7 +88,7 @@ def spread_stamps(t: Array) -> tuple[Array, float]:
     step = float(np.sum(steps)) / max(len(steps), 1)
     if len(t) < 8 or not step > 0.0 or steps.min() < 0.0:
         return t, 0.0
-    # Where few steps are unlike the others, samples are lost or stand twice.
+    # If few steps are unlike the others, samples are lost or stand twice.
     usual = float(np.median(steps))
     if usual > 0.0 and np.mean(np.abs(steps - usual) > COARSEST_STAMP * step) < _UNEVEN:
         return t, 0.0
@@ -107,7 +107,7 @@ def spread_stamps(t: Array) -> tuple[Array, float]:
         return t[0] + start + slope * rows, rounding
     if len(first) < 3 or len(t) < 2 * len(first):
         return t, 0.0
-    # Where rows are lost, the others of that stamp would be spread over the gap.
+    # If rows are lost, the others of that stamp would be spread over the gap.
     width = np.minimum(np.diff(t[first]) / np.diff(first), 1.5 * step)
     rate = np.concatenate([np.repeat(width, np.diff(first)), np.full(len(t) - first[-1], step)])
     within = rows[first[0] :] - np.repeat(first, np.diff(np.append(first, len(t))))
@@ -119,9 +119,8 @@ def spread_stamps(t: Array) -> tuple[Array, float]:
 def find_fresh_rows(columns: Sequence[Array]) -> NDArray[np.intp] | None:
     """Rows with new readings, where a logger that is faster than its source repeats them.
 
-    Of readings (T,) that belong together, such as positions. Where all rests, rows at the rate of
-    the source. None where rows are not held at regular intervals, or are an encoder's that moves
-    slowly.
+    The readings (T,) belong together, such as positions; while all rest, rows are taken at the rate
+    of the source. None if rows are not held at regular intervals, or an encoder moves slowly.
     """
     if not columns or len(columns[0]) < 8:
         return None
@@ -135,7 +134,7 @@ def find_fresh_rows(columns: Sequence[Array]) -> NDArray[np.intp] | None:
     regular = np.abs(held - usual) <= max(1.0, 0.25 * usual)
     if regular.mean() < _REGULAR:
         return None
-    # What rests for longer is read at the rate of the source, too.
+    # Longer rests are read at the rate of the source, too.
     every = float(held[regular].mean())
     parts = np.where(held > 2.0 * usual + 1.0, np.maximum(np.rint(held / every), 1.0), 1.0)
     index = np.repeat(np.arange(len(rows)), parts.astype(int))
@@ -396,5 +395,5 @@ def note_clock(table: TrialTable) -> None:
 
 
 def _few(table: TrialTable, total: int) -> int:
-    """How many rows may be dropped for their time stamps."""
+    """Limits on the rows that may be dropped for their time stamps."""
     return max(3, int(table.limits.dropped_share * total))

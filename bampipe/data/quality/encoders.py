@@ -135,7 +135,7 @@ def check_velocity(table: TrialTable, encoder: Encoder) -> None:
         return
     speed = table.columns.pop(encoder.velocity.column) * encoder.velocity.scale
     position = (table.columns[encoder.column] - encoder.zero) * encoder.scale
-    # What the velocity says of how far the axis goes over short stretches, beside how far it went.
+    # Distances over short stretches: as moved, and as expected by the velocity.
     every = max(1, round(_WINDOW_S / float(np.median(np.diff(table.t)))))
     moved, expected = (np.diff(x[::every]) for x in (position, integral(table.t, speed)))
     size = float(moved @ moved), float(expected @ expected)

@@ -1,4 +1,4 @@
-"""Readings that are none: wild ones, dead stretches, and what stands at a rail."""
+"""Faulty readings: wild ones, dead stretches, and readings at a rail."""
 
 from collections.abc import Sequence
 
@@ -18,15 +18,15 @@ _CALM = 0.05
 """Share of that by which its neighbours may change their pace: a machine at a stop turns round, and
 the kick of a controller leaves its drive unsteady."""
 _LEAP, _OFTEN, _ALIKE = 6.0, 3, 0.1
-"""Of the median curvature, where there is any: that of a leap of an axis; such leaps, the least;
-share of their height by which pulses of one train differ."""
+"""Curvature of a leap of an axis over the median curvature, if there is any; fewest such leaps;
+share of their height by which the pulses of one train differ."""
 _LONGEST_SPIKE = 2
-"""Samples of one spike, the most."""
+"""Most samples of one spike."""
 _ROUNDING = 1e-6
 """Share of the range below which a change is no step of the sensor."""
 _SHORTEST_S = 0.1
 _CHANCE = 1e-9
-"""Of so long a run of equal readings, from the share of equal neighbours in the rest."""
+"""Chance of so long a run of equal readings, by the share of equal neighbours in the rest."""
 _UNSTEADY = 0.1
 """Least share of changes that take back the one before: readings with noise, no set-points."""
 _MOST_DEAD = 0.2
@@ -34,23 +34,23 @@ _MOST_DEAD = 0.2
 _MOVES = 0.02
 """Share of its travel in the trial that some axis covers meanwhile."""
 _TIMES_BESIDE = 5
-"""How much more often a rail is read than any level near it."""
+"""Least ratio of the readings at a rail to those at any level near it."""
 _LONGEST_RUN = 5
-"""Samples in a row at a rail, the least that its longest run has."""
+"""Fewest samples in the longest run at a rail."""
 _LEAST_AT_RAILS, _MOST_AT_RAILS = 0.005, 0.6
-"""Share of the samples at rails: below, they are left; above, the column is rather a command."""
+"""Share of samples at rails: below, they are ignored; above, the column is rather a command."""
 _FEWEST_LEVELS = 50
-"""Different readings of a column that goes from one value to another rather than in steps."""
+"""Fewest different readings of a column that moves continuously rather than in steps."""
 _BESIDE = 10
-"""Levels next to a rail that it is held against."""
+"""Number of levels next to a rail with which it is compared."""
 _EXPLAINED = 0.5
-"""Share of the variance between the rails that the motion must explain to tell what is beyond."""
+"""Share of the variance between the rails that the motion must explain to predict it beyond."""
 _ONE_STEP, _MATTERS = 0.85, 1e-3
-"""Share of what the motion leaves of an input that one step is; of its variance, what is left."""
+"""Least share of an input's residual that one step explains; least residual, of its variance."""
 _MOST_ROWS = 20_000
-"""Of which that is found."""
+"""Most rows of that regression."""
 _BEYOND = 2.0
-"""Times what it leaves there, by which the motion must ask for more than the rail, in the mean."""
+"""Least mean excess of the predicted input over the rail, in deviations of its residual."""
 
 
 def find_spikes(values: np.ndarray, rule: tuple[float, float]) -> np.ndarray:
@@ -177,7 +177,7 @@ def find_rails(values: np.ndarray) -> dict[float, Flags]:
 
 
 def leave_out_rails(table: TrialTable) -> None:
-    """Leave out what an input reads at a rail.
+    """Leave out the readings of an input at a rail.
 
     A command that stands at its limit is all that the machine gets; a reading that does tells
     nothing. A sensor's volts are readings; of other inputs the motion says which of the two they
@@ -231,7 +231,7 @@ def _motions(table: TrialTable, every: int = 1) -> list[SmoothedMotion]:
 
 
 def _sides(motions: list[SmoothedMotion]) -> Array:
-    """What a drive is regressed on, (T, P)."""
+    """Regressors of a drive, (T, P)."""
     sides = [np.ones(len(motions[0].position))]
     for motion in motions:
         angle, by_direction = motion.position, np.abs(motion.moving[:, 1])
@@ -274,7 +274,7 @@ def refuse_new_zero(table: TrialTable) -> None:
 def _beyond(
     values: np.ndarray, rails: dict[float, Flags], motions: list[SmoothedMotion]
 ) -> float | None:
-    """How far the motion takes an input beyond its rails; 0 where it does not, None: not told."""
+    """Farthest value beyond its rails that the motion asks of an input; 0: none, None: unknown."""
     if not motions:
         return None
     design, target = _sides(motions), motions[0].smooth(values)

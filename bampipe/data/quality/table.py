@@ -1,4 +1,4 @@
-"""A trial while it is being cleaned, what still counts as sound, and a sound trial thinned."""
+"""A trial while it is being cleaned, the limits of a sound one, and the thinning of it."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
@@ -25,7 +25,7 @@ folds makes up for what is taken off, and white noise stays white, as sensors ar
 
 @checked_dataclass(frozen=True, config=STRICT)
 class CleaningLimits:
-    """What still counts as a sound trial.
+    """Limits within which a trial counts as sound.
 
     Attributes:
         shortest_s: a trial shorter than this, s, is set aside.

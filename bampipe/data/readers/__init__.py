@@ -25,7 +25,7 @@ from bampipe.errors import InputError, located
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 """File extensions of tables as text."""
 SHEETS = (".xlsx", ".xlsm")
-"""Of workbooks, whose first sheet with rows is read as a text."""
+"""File extensions of workbooks, whose first sheet with rows is read as text."""
 _OBJECTS = (".json", ".jsonl", ".ndjson")
 _AGAIN = "copy it again from the logger"
 Reader = ModuleType | arrays.ArrayReader
@@ -42,7 +42,7 @@ _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     ((".mcap",), bag, "MCAP file", f"{_AGAIN}, with the message definitions in it"),
     ((".npy", ".npz"), arrays.READER, "file of NumPy", "save it again with np.savez"),
 )
-"""File extensions and their reader; of what libraries read, what to do where they cannot."""
+"""File extensions, their reader, its name for the file, and the remedy if it cannot read one."""
 _READERS = {extension: reader for own, reader, _, _ in _FORMATS for extension in own}
 _FOREIGN = {extension: (kind, remedy) for own, _, kind, remedy in _FORMATS for extension in own}
 _FOREIGN[".gz"] = "gzip archive", _AGAIN
@@ -51,9 +51,9 @@ EXTENSIONS = tuple(_READERS)
 
 _HEAD = 1 << 10
 _MOST_UNPACKED, _LEAST_ROOM = 100, 2 << 30
-"""Of the size of a file, and bytes, which it may take in memory while it is read, if it is free."""
+"""Memory that reading a file may take: a multiple of its size, and bytes at least, if free."""
 _KINDS = [(kind["bytes"].encode("latin-1"), kind) for kind in VOCABULARY["first_bytes"]]
-"""Bytes that a kind of file begins with, and what it is."""
+"""First bytes of a kind of file, and its entry in the vocabulary."""
 
 
 def read_trial(
@@ -65,7 +65,7 @@ def read_trial(
     datetimes: Mapping[str, str] | None = None,
     dialect: Dialect | None = None,
 ) -> RawTrial:
-    """Read the wanted columns of one trial file; its extension says of what format.
+    """Read the wanted columns of one trial file; its extension gives the format.
 
     Args:
         path: the file.
@@ -100,16 +100,16 @@ def is_text(name: str) -> bool:
 
 
 def extension_of(name: str) -> str:
-    """File extension in lower case; of a text or JSON under gzip, that of what it holds."""
+    """File extension in lower case; under gzip, that of the text or JSON inside."""
     path = Path(name)
     inner, own = Path(path.stem).suffix.lower(), path.suffix.lower()
     return inner if own == ".gz" and inner in (*TEXTS, *_OBJECTS) else own
 
 
 def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) -> dict[str, str]:
-    """Names of what one trial file holds that can be read as a column, with units it states.
+    """Names of all that can be read as a column of one trial file, with units it states.
 
-    The unit is "datetime" for dates and times, "" where the file does not say. A ``dialect`` is
+    The unit is "datetime" for dates and times, "" if the file does not say. A ``dialect`` is
     that of a text.
 
     Raises:

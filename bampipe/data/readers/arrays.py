@@ -48,7 +48,7 @@ class Stored:
         shape: of the array; kind: of its type, as NumPy has it, or what else it is; texts that are
             known to be dates and times are of theirs.
         load: reads it; texts come as objects.
-        unit: that the file states, "" where it does not.
+        unit: that the file states, "" if it does not.
     """
 
     shape: tuple[int, ...]
@@ -61,7 +61,7 @@ NAMES = ("name", "label", "signalname", "signal", "channel")
 _VALUES = ("values", "value", "data")
 """Fields that hold the name of a signal, and its samples."""
 Arrays = Mapping[str, Stored]
-"""What a file holds, by name."""
+"""Content of a file, by name."""
 Opened = tuple[Arrays, tuple[str, ...]]
 
 
@@ -120,7 +120,7 @@ def _read_column(array: Stored, index: int | None, form: str | None) -> np.ndarr
 
 
 def _fault(variable: str, known: Arrays, where: str) -> InputError:
-    """That a variable is no array of numbers, moments or texts, or that it is not there."""
+    """Error on a variable that is missing, or is no array of numbers, moments or texts."""
     within = (f"{variable}.", f"{variable}/", f"{variable}[0].")
     if inside := [other for other in known if other.startswith(within)]:
         remedy = f"name what is in it: {', '.join(inside[:8])}"
@@ -256,7 +256,7 @@ def _by(shape: Iterable[int]) -> str:
 
 
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
-    """What the columns of a variable are called: its name, or ``name[0]``, ``name[1]``, ..."""
+    """Names of the columns of a variable: its own, or ``name[0]``, ``name[1]``, ..."""
     sides = [extent for extent in shape if extent != 1]
     if 0 in shape or len(sides) > 2:
         return []
@@ -395,7 +395,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
 
 
 def _fields(name: str, array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """An array of numbers itself; of records, what is in them."""
+    """An array of numbers itself; of records, their contents."""
     if array.dtype.names is None:
         yield name, array
     for field in array.dtype.names or ():

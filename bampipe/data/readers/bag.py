@@ -29,7 +29,7 @@ from bampipe.errors import InputError
 RECORDED = "@time"
 STAMP = "header.stamp"
 _LISTS = ("position", "velocity", "effort")
-"""Of a message with names of joints: what may be empty."""
+"""Lists that may be empty in a message with names of joints."""
 
 
 class Field(NamedTuple):
@@ -167,7 +167,7 @@ def _read_streams(path: Path, fields: Mapping[str, Field], wanted: Wanted) -> li
 
 
 def _kind(message: Any) -> tuple[Any, ...]:
-    """What tells the messages of one publisher from those of another: names and empty lists."""
+    """Names and empty lists, which distinguish the messages of one publisher from another's."""
     names = names_in(message)
     lists = {key: find(message, key) for key in _LISTS} if names else {}
     empty = (key for key, found in lists.items() if found is MISSING or len(found) == 0)
@@ -175,7 +175,7 @@ def _kind(message: Any) -> tuple[Any, ...]:
 
 
 def _left_out(topic: str, streams: list[_Stream], used: Collection[_Stream]) -> str:
-    """What to say of the messages on a topic that are not used."""
+    """Sentence on the messages of a topic that are not used."""
     here = [stream for stream in streams if stream.topic == topic]
     unused = [stream for stream in here if stream not in used]
     count, total = (sum(len(s.recorded) for s in part) for part in (unused, here))
@@ -209,7 +209,7 @@ def _numbers_in(message: Any) -> dict[str, None]:
 
 
 def _stamp(message: Any) -> int | None:
-    """Time stamp in a message, ns since 1970; None where it has none."""
+    """Time stamp in a message, ns since 1970; None if it has none."""
     sec, nanosec, nsec = (find(message, f"{STAMP}.{key}") for key in ("sec", "nanosec", "nsec"))
     nanosec = nsec if nanosec is MISSING else nanosec
     if not isinstance(sec, int | np.integer) or not isinstance(nanosec, int | np.integer):

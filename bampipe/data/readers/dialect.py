@@ -1,4 +1,4 @@
-"""How a text file of numbers is laid out: found in its first lines, or refused.
+"""Layout of a text file of numbers: found in its first lines, or refused.
 
 Labs write tables with commas, semicolons, tabs, bars or blanks between columns, with points or
 commas as decimal signs, with lines of remarks above the header and a line of units below it. What
@@ -45,21 +45,21 @@ _SCALES = re.compile(r"(?i)scal(e|ing)[ _]?(factor)?|factor|faktor|skalierung|ls
 _SEARCHED = 200
 _TRIED = 400
 _ALIKE = 0.97
-"""Of the most numbers in cells, what is as good: words above the samples may hold a number."""
+"""Share of the most numbers in cells that is as good: words above samples may hold a number."""
 _LEAST_FILLED = 0.04
-"""Share of the first lines in which a column holds something, the least."""
+"""Least share of the first lines in which a column holds something."""
 
 
 @dataclass(frozen=True)
 class TableLayout:
-    """Where the samples of a text file start and how they are written.
+    """Start and notation of the samples of a text file.
 
     Attributes:
         first_line: number of the line with the first sample, as an editor counts.
         start: bytes before that line.
-        remarks: what is unlike a plain table with commas, a sentence each.
+        remarks: differences from a plain table with commas, a sentence each.
         units: units that the header or a line below it gives, by column.
-        title: the line that is the header, "" where there is none.
+        title: the header as a line, "" if there is none.
     """
 
     delimiter: str
@@ -94,7 +94,7 @@ class TableLayout:
         """Whether a line among the samples is text without a number in any cell, or ends in it."""
         row = [cell for cell in self.cells(text) if cell not in NULLS]
         count = sum(_is_number(cell, self.decimal) or is_moment(cell) for cell in row)
-        # A title of what follows may hold the number of it.
+        # The title of a block may hold its number.
         titled = len(self.cells(text)) != len(self.header) and self.is_remark(text)
         plain = 2 * count < len(row) if titled else not count
         wordy = plain and text.expandtabs().isprintable() and any(map(str.isalpha, text))
@@ -413,7 +413,7 @@ def _named_items(header: list[str], below: list[str], delimiter: str) -> list[st
 
 
 def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
-    """Where the samples start and what separates their columns; several where that is equal."""
+    """Candidate starts of the samples and delimiters of their columns that are equally good."""
     ranked: list[tuple[float, int, str]] = []
     tried = [line for line in lines[-_TRIED:] if line.text.strip()]
     for delimiter in delimiters:
@@ -435,11 +435,11 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
             [n for n, row in enumerate(split) if numbers[n] > 0.5 * of(row)]
             for of in (len, lambda row: sum(map(bool, row)))  # of cells, or of those with something
         ]
-        # What is written of the log above it may be numbers, but not for several lines.
+        # Remarks above a log may be numbers, but not for several lines.
         most = next(filter(None, samples), [])
         first = next((n for n, end in zip(most, most[3:], strict=False) if end - n < 6), -1)
         first = first if first >= 0 else next(iter(most), len(lines))
-        # What was logged before all sensors had answered are samples with empty cells.
+        # Rows logged before all sensors had answered are samples with empty cells.
         while 0 < first < len(lines) and _is_sparse(cells(lines[first - 1].text, delimiter), width):
             first -= 1
         found.append((first, delimiter))
@@ -454,7 +454,7 @@ def _is_sparse(row: list[str], width: int) -> bool:
 
 
 def _number_cells(row: list[str], delimiter: str) -> int:
-    """How many cells of a line are numbers or moments; a comma inside one is a decimal sign."""
+    """Number of cells that are numbers or moments; a comma inside one is a decimal sign."""
     decimal = "." if delimiter == "," else ","
     return sum(_is_number(cell, decimal) or is_moment(cell) for cell in row)
 

@@ -26,12 +26,12 @@ _BLOCK_ROWS = 1 << 14
 _COLUMNS = ("columns", "channels", "names", "column_names", "labels", "fields")
 """Attributes with the names of the columns of a matrix."""
 _PACKED = {"scale_factor": 1.0, "add_offset": 0.0}
-"""Attributes by which netCDF packs numbers into integers, and what they are where left out."""
+"""Attributes by which netCDF packs numbers into integers, and their defaults."""
 
 
 @contextmanager
 def opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
-    """What an HDF5 file holds."""
+    """Content of an HDF5 file."""
     import h5py  # heavy: only for these files
 
     with h5py.File(path, "r") as file:
@@ -46,7 +46,7 @@ READER = ArrayReader("dataset", opened)
 
 
 def numbers_of(path: Path) -> dict[str, float]:
-    """Single numbers in the attributes of a file and of what is in it, by their names."""
+    """Single numbers in the attributes of a file and of its contents, by name."""
     import h5py
 
     found: dict[str, Any] = {}
@@ -60,9 +60,9 @@ def numbers_of(path: Path) -> dict[str, float]:
 
 
 def _arrays(file: Any, alone: bool) -> Iterator[tuple[str, Stored]]:
-    """What a file holds by name: datasets, fields of compound ones, columns of a matrix with names.
+    """Yield content by name: datasets, fields of compound ones, columns of a matrix with names.
 
-    Such a matrix itself, too, unless its columns are wanted ``alone``.
+    Such a matrix is yielded itself, too, unless its columns are wanted ``alone``.
     """
     for label, data in _datasets(file):
         if data is None:

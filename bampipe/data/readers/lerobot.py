@@ -48,7 +48,7 @@ class DataSet:
 
 
 def open_dataset(folder: Path, episodes: str = "") -> DataSet | None:
-    """Return the data set in ``folder``; None where it is no data set of LeRobot.
+    """Return the data set in ``folder``; None if it is no data set of LeRobot.
 
     Args:
         folder: that holds ``meta`` and ``data``.
@@ -120,7 +120,7 @@ def vector_columns(path: Path, schema: pa.Schema) -> dict[str, tuple[str, int]]:
 
 
 def describe_loops(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> str:
-    """Say how late every joint of a data set follows its goal; "" where it has no joints.
+    """Say how late every joint of a data set follows its goal; "" if it has no joints.
 
     ``t``: time stamps of an episode, (T,), s; ``columns``: of it by name, each (T,).
     """

@@ -13,7 +13,7 @@ from bampipe.data.readers.trial import NUMBER
 from bampipe.errors import InputError
 
 MISSING = object()
-"""What `find` returns where there is nothing, which is not the same as null."""
+"""Returned by `find` where there is nothing, which is not the same as null."""
 
 _MOST_ITEMS = 64
 _DEEPEST = 6
@@ -23,7 +23,7 @@ _SPREAD = re.compile(
 
 
 def find(value: Any, path: str) -> Any:
-    """What stands at ``path``; an item of a list by its number, or by a list ``name`` beside it."""
+    """Value at ``path``; items of a list go by number, or by a list ``name`` beside it."""
     if isinstance(value, Mapping) and path in value:
         return value[path]
     parent = value
@@ -40,7 +40,7 @@ def find(value: Any, path: str) -> Any:
 
 
 def items(value: Any, path: str) -> list[Any]:
-    """What stands at ``path`` in every item of a list: ``q[:]``, ``samples[:].q``, ``data[1::3]``.
+    """Values at ``path`` in every item of a list: ``q[:]``, ``samples[:].q``, ``data[1::3]``.
 
     The last is every third item from the second on, as of rows of three numbers.
     """
@@ -109,7 +109,7 @@ def _names_beside(parent: Any, values: Any) -> list[str]:
 
 
 def _keys(value: Any) -> list[str]:
-    """Names of what an object or a table holds."""
+    """Names in an object or a table."""
     if isinstance(value, Mapping):
         return [str(key) for key in value]
     return [key for key in getattr(value, "__dataclass_fields__", {}) if not key.startswith("_")]

@@ -21,7 +21,7 @@ from bampipe.data.units import units_beside
 from bampipe.errors import InputError
 
 _TRIED = 400
-"""Samples whose values are columns; what later ones alone hold is none."""
+"""Samples whose values become columns; values that only later ones hold do not."""
 
 
 def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -58,13 +58,13 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _name_of(item: object) -> object:
-    """What an object says that it is called; anything else itself."""
+    """The name that an object states; anything else unchanged."""
     own = item.items() if isinstance(item, dict) else ()
     return next((text for key, text in own if key.lower() in known_arrays.NAMES), item)
 
 
 def _with_lists(content: object, depth: int = 2) -> object:
-    """What was parsed, with lists for objects whose keys are numbers of rows, as pandas writes."""
+    """Parsed content with lists for objects whose keys are row numbers, as pandas writes."""
     if not isinstance(content, dict) or depth == 0:
         return content
     if len(content) > 1 and all(key == str(n) for n, key in enumerate(content)):
@@ -74,7 +74,7 @@ def _with_lists(content: object, depth: int = 2) -> object:
 
 @contextmanager
 def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
-    """What a file holds by name, what is ``wanted`` by other names too, and what was left out.
+    """Content of a file by name, ``wanted`` values by other names too, and notes on omissions.
 
     It holds a list of objects, a list under one key, or one object a line (.jsonl). Numbers beside
     that list are the same at every sample: a column for each of them.
@@ -147,7 +147,7 @@ READER = ArrayReader("value", _opened)
 
 
 def _stating(found: Mapping[str, Stored], units: Mapping[str, str]) -> dict[str, Stored]:
-    """What was found and the units of other quantities, such as ``"force units": "kip"``."""
+    """Add the units that are stated of other quantities, such as ``"force units": "kip"``."""
     return {
         **found,
         **{x: stored(None, u, known_arrays.STATED) for x, u in units.items() if x not in found},

@@ -25,7 +25,7 @@ _KINDS = {
     "M": (pa.types.is_timestamp,),
     "O": (pa.types.is_date, pa.types.is_string, pa.types.is_large_string),
 }
-"""Kinds of arrays, as NumPy has them, by what tells the type of a column."""
+"""NumPy's kinds of arrays, by the test for the type of a column."""
 
 
 @contextmanager

@@ -41,14 +41,14 @@ _BROKEN = re.compile(r'(?<![^\n,;\t])"[^",;\t\r\n]*(?:[\r\n]+[^",;\t\r\n]*){1,3}
 _TYPESET = {"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2009": " "}
 """Minus and blanks of typesetters."""
 _MOST = 0.8
-"""Share of the first lines that are written alike, the least."""
+"""Least share of the first lines that are written alike."""
 _TRIED, _FEWEST, _MOST_SIGNALS = 400, 5, 64
 _DELIMITERS = (";", "\t", ",", "|")
 
 
 @dataclass(frozen=True)
 class Form:
-    """How the lines of a text, which ``said`` describes, become rows of a table.
+    """A form of text, described by ``said``, and the function that makes it a table.
 
     ``names`` are those of the columns, where no line holds them.
     """
@@ -83,7 +83,7 @@ def unbroken(text: str) -> str:
 
 
 def _by_path(message: str) -> dict[str, str]:
-    """What a message as YAML holds by its path; of lists each item, by a list ``name`` if any."""
+    """Values of a YAML message by path; items of lists one by one, by a list ``name`` if any."""
     path, found = dict[int, str](), dict[str, list[str]]()
     for match in filter(None, map(_OF_MESSAGE.match, message.splitlines())):
         indent, key, said = match.groups()
@@ -324,9 +324,9 @@ def _without_unit(cell: str, end: str) -> list[str]:
 
 
 def _named_lists(rows: list[list[str]], widths: Sequence[int]) -> list[list[str]]:
-    """What items of cells that are lists are called: by a list of names, or by number.
+    """Names of the items of cells that are lists: from a list of names, or numbers.
 
-    Nothing of other cells.
+    Other cells have none.
     """
     words = (re.findall(r"[^\W\d][\w/]*", cell) for cell in rows[0] if cell[:1] in "[(")
     names = {len(own): [f".{x}" for x in own] for own in words if own}

@@ -32,7 +32,7 @@ _LEAST_ROWS, _MANY_ROWS = 0.05, 0.5
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _WESTERN = "cp1252"
 _TAKEN_AS = {_WESTERN: "Windows-1252", "gb18030": "GBK", "shift_jis": "Shift-JIS"}
-"""Encodings of what is not UTF-8, by their usual names."""
+"""Encodings other than UTF-8, by their usual names."""
 
 
 def read(path: Path, wanted: Wanted) -> RawTrial:
@@ -74,10 +74,10 @@ def columns(path: Path, dialect: Dialect | None = None) -> dict[str, str]:
 
 
 def above_samples(path: Path) -> str:
-    """What stands above the samples of a table.
+    """The text above the samples of a table.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not a table.
     """
     head, dialect = _rewritten_head(path, Dialect())
     if dialects.share_of_rows(head) < _LEAST_ROWS:
@@ -103,7 +103,7 @@ def _rewritten_head(path: Path, dialect: Dialect) -> tuple[bytes, Dialect]:
 
 @contextmanager
 def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, tuple[str, ...]]]:
-    """The file as a table in UTF-8, itself or a copy in memory; its dialect, and what to say of it.
+    """The file as a table in UTF-8, itself or a copy in memory; its dialect, and remarks on it.
 
     InputError where it is not in the encoding that it claims.
     """
@@ -181,7 +181,7 @@ def _encoding(head: bytes) -> str:
 
 
 def _asian(head: bytes) -> str:
-    """The encoding of Chinese or Japanese in which all letters beyond ASCII are, "" where not."""
+    """The Chinese or Japanese encoding in which all bytes beyond ASCII are letters, or ""."""
     runs = re.findall(rb"[\x80-\xff]+", head)
     if not runs or _sound(head, "utf-8"):
         return ""
@@ -215,7 +215,7 @@ def _head(stream: BinaryIO) -> bytes:
 
 @dataclass
 class _Samples:
-    """What has been read of a file: the wanted columns in parts, how many rows; see `RawTrial`."""
+    """Samples read so far: the wanted columns in parts, number of rows; see `RawTrial`."""
 
     wanted: Wanted
     nothing: list[str] = field(default_factory=list)
@@ -370,7 +370,7 @@ def _is_end(stream: BinaryIO, line: Line, end: int, layout: TableLayout) -> bool
 
 
 def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, ...]]:
-    """Byte where the last whole row ends, and what is said about the rest.
+    """Byte where the last whole row ends, and the remark on the rest.
 
     A last line is cut off when it has too few cells, or when it has no line end and its last
     cell does not have as many decimals as the one above.
@@ -421,7 +421,7 @@ def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> Line | 
 
 
 def _fault(message: str, layout: TableLayout, line: Line | None) -> InputError:
-    """The plain form of what Arrow says about a text file."""
+    """The plain form of Arrow's message on a text file."""
     at = [f"row {line.number}"] if line is not None else []
     torn = _TORN.search(message)
     if torn:

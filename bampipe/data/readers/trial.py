@@ -1,4 +1,4 @@
-"""What a reader is asked for and what it returns, and the checks that all readers share."""
+"""Requests to readers and their results, and the checks that all readers share."""
 
 import gzip
 import importlib
@@ -15,29 +15,29 @@ from bampipe.errors import InputError, did_you_mean
 from bampipe.schema import Declaration, Distinct, Text
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-"""How a number is written, with a point."""
+"""Pattern of a number with a decimal point."""
 LARGEST_BYTES = 4 << 30
 """A trial larger than this in memory is refused unless the caller allows more."""
 
 
 class Dialect(Declaration):
-    """What a session says about its text files; what it leaves open is found in the file."""
+    """Statements of a session about its text files; the rest is found in the file."""
 
     delimiter: Literal["", ",", ";", "\t", "|", " "] = ""
-    """What stands between columns; a blank: any number of them"""
+    """Separator of columns; a blank stands for any number of them"""
     decimal: Literal["", ".", ","] = Field(default="", description="Decimal sign")
     encoding: Literal["", "utf-8", "utf-16", "latin-1", "cp1252"] = ""
     """Of the characters"""
     names: Distinct[Text] = ()
     """Names of the columns, for files without a header"""
     missing: Distinct[Text] = Field(
-        default=(), description='What a cell says that holds no reading, such as "ovf"'
+        default=(), description='Text of a cell without a reading, such as "ovf"'
     )
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What to read of a file.
+    """Request to a reader.
 
     Attributes:
         columns: their names; datetimes: ``strptime`` format of each that holds dates and times, ""
@@ -161,7 +161,7 @@ def interpolated(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.nd
 
 
 def opened(path: Path) -> BinaryIO:
-    """The file, or what gzip holds of it."""
+    """The file, unpacked if it is under gzip."""
     return cast(BinaryIO, gzip.open(path)) if path.suffix.lower() == ".gz" else path.open("rb")
 
 

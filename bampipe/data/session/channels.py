@@ -190,7 +190,7 @@ class Encoder(NamedDeclaration):
 
     @property
     def resolution(self) -> float | None:
-        """Smallest step, rad or m; None where only the data can tell."""
+        """Smallest step, rad or m; None if only the data can tell."""
         if self.counts:
             return abs(self.scale)
         return None if self.stated_resolution is None else abs(self.stated_resolution * self.scale)
@@ -492,7 +492,7 @@ class Channel(NamedDeclaration):
 
     @property
     def raw_unit(self) -> str:
-        """Unit of the column, "" where the session file rescales it."""
+        """Unit of the column, "" if the session file rescales it."""
         changing = {"stated_scale", "stated_offset", "wrap_bits", "sign_bit"}
         return "" if changing & self.model_fields_set else self.stated_unit
 

@@ -36,7 +36,7 @@ SESSION = "session.toml"
 _TRIALS = frozenset({"trial", "run", "condition", "test", "block", "versuch"})
 """Words in the name of a column that numbers trials."""
 _LEAP_S, _SHORTEST_S, _MOST_CUTS = 1.0, 2.0, 200
-"""Length, s, of what lies between two trials and of a trial, the least; cuts, the most."""
+"""Shortest pause between two trials and shortest trial, s; most cuts."""
 _GUESSED_GEAR = ", scale_sd = 0.1"
 """Of a reduction that weight shows beside bodies that are drawn to 15 %."""
 
@@ -47,7 +47,7 @@ class ProposedSession:
 
     Attributes:
         session: text of ``session.toml``.
-        device: text of a device file to write beside it, "" where there is one already.
+        device: text of a device file to write beside it, "" if there is one already.
         fill_in: what only a person can know, a sentence each; the session is refused without.
         check: guesses, a sentence each.
         passed: files left out, with the reason.
@@ -157,7 +157,7 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> 
     if chosen.device.force_unit == "A":
         found = zip(joints, turns, of_motor, strict=True)
         guessed = {j: (n, 1.0 / size) for j, n, size in found}
-        # Where most is carried, errors of single bodies count least.
+        # On the joint that carries most, errors of single bodies count least.
         size = {
             name: float(np.nanstd(columns.columns[name].values) / abs(drive.share))
             for name, drive in columns.drives.items()

@@ -51,7 +51,7 @@ class ChosenDevice:
 
     Attributes:
         name: of a built-in device, or the path of a device file relative to the folder of logs.
-        text: of a new device file, "" where there is one already.
+        text: of a new device file, "" if there is one already.
     """
 
     name: str

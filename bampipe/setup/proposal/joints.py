@@ -112,7 +112,7 @@ def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Gro
         for group in _numbered_alike(columns, split).values()
         if len(group) == len(names)
     ]
-    # What is on the side of the motors stands for their joints only where nothing else does.
+    # Columns on the motors' side stand for their joints only if no others do.
     found.sort(key=lambda group: "motor" in _tokens(group.columns[0].name))
     taken: set[str] = set()
     chosen = []
@@ -130,7 +130,7 @@ def _named_alike(
 ) -> dict[Tokens, dict[str, SurveyedColumn]]:
     """Columns by name of the joint, those together whose names are alike but for it."""
     groups: dict[Tokens, dict[str, SurveyedColumn]] = {}
-    # Of names that contain one another, such as wrist and wrist_roll, the longest that is there.
+    # If names contain one another, as wrist_roll does wrist, the longest one counts.
     for column in columns:
         for name in sorted(said, key=lambda name: -len(said[name])):
             rest = _without(split[column.name], said[name])
@@ -171,7 +171,7 @@ def _tokens(name: str, unit_of: str = "") -> Tokens:
 
 
 def _without(tokens: Tokens, part: Tokens) -> Tokens | None:
-    """``tokens`` with ``part``, which stands in them once, replaced; None where it does not."""
+    """Return ``tokens`` with ``part`` replaced, None unless it stands in them once."""
     places = [k for k in range(len(tokens) - len(part) + 1) if tokens[k : k + len(part)] == part]
     if len(places) != 1:
         return None

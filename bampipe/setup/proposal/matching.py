@@ -36,7 +36,7 @@ class Matcher:
         robot: columns of a robot of which the drawing tells, and how they are counted.
         turning: what the readings of a position are worth, by the weight on it, by name of column.
         given: columns that are known, by name of axis or input.
-        reacting: the column of a drive that has the sign of the reaction, "" where none has.
+        reacting: the column of a drive that has the sign of the reaction, "" if none has.
         of_motor: the column of a motor's torque beside the position of its joint, by name.
         geared: the position that may be a motor's before a gear of which nothing tells, by name.
         rivals: names of columns that may be the position, where there are several.
@@ -93,7 +93,7 @@ class Matcher:
         drives = [c for c in self.found.of(*DRIVERS) if not c.is_constant]
         if len(drives) != 1:
             return best
-        # Of a pole on a cart and the cart, what is driven is the cart.
+        # Of a cart and the pole on it, the cart is driven.
         share = {c.name: self._share(c, drives[0]) for c in found}
         most = max(found, key=lambda c: share[c.name])
         clear = 1.0 - share[most.name] < guesses.CLEARLY * (1.0 - share[best.name])
@@ -178,8 +178,8 @@ class Matcher:
         named = [c for role in DRIVERS for c in self.found.of(role) if not c.is_constant]
         best = self.driving(position) or next(iter(named), None)
         if best is not None and not best.unit and best.name in self.registers:
-            # What a servo calls its load is the share of the supply that its bridge is on: no force
-            # comes as a register, and a current is called one.
+            # The load of a servo is the share of the time that its bridge is on: no force comes as
+            # a register, and a current is called one.
             return best, "current" if best.role == "current" else "duty"
         if best is None or best.role not in DRIVERS:
             return best, "force"
@@ -196,7 +196,7 @@ class Matcher:
     def driving(self, position: SurveyedColumn) -> SurveyedColumn | None:
         """The column that acceleration, velocity and friction of the motion explain best."""
         share = {}
-        # What is asked of a coil brakes the motion, and follows it where a force is controlled.
+        # The command of a coil brakes the motion, and follows it if a force is controlled.
         asked = REFERENCE_WORDS if self.found.of("force") else frozenset[str]()
         for column in self.found.columns:
             known = column.name in self.used or column.role in _NEVER_DRIVES

@@ -20,7 +20,7 @@ SLIDING, _SHARES = map(word_set, ("sliding", "shares"))
 _FORCES, _TORQUES = map(word_set, ("forces", "torques"))
 _FEWEST_COUNTS = 100
 _MOST_WILD = 0.01
-"""Share of the readings that are wild or missing, the most."""
+"""Largest share of the readings that may be wild or missing."""
 
 
 def is_velocity(column: SurveyedColumn) -> bool:

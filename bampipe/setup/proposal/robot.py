@@ -77,9 +77,9 @@ class Logged:
     def compare(
         self, positions: Group, drives: Group, ratio: Array, turned: Array | float = 1.0
     ) -> tuple[Comparison, Comparison] | None:
-        """The drives beside the drawing, at few samples and at many; None where these do not do.
+        """Compare drives and drawing at few samples and at many; None if the samples do not do.
 
-        ``turned``: of what the encoders sit on, turns for one of its joint, (n,).
+        ``turned``: turns of what each encoder sits on for one of its joint, (n,).
         """
         q, step = self.positions(positions) / turned, float(np.median(np.diff(self.t)))
         window = max(5, 2 * round(0.5 * _SMOOTHED_S / step) + 1) if step > 0.0 else len(q)
@@ -100,7 +100,7 @@ class Logged:
     def explain(
         self, positions: Group, drives: Group, ratio: Array, turned: Array | float = 1.0
     ) -> Gears | None:
-        """How the drawing explains the drives, best mounted; None where they do not compare."""
+        """Explanation of the drives by the drawing, best mounted; None if they do not compare."""
         compared = self.compare(positions, drives, ratio, turned)
         if compared is None:
             return None
@@ -111,7 +111,7 @@ class Logged:
     def explain_geared(self, positions: Group, drives: Group, turns: Array) -> Gears | None:
         """Positions of motors whose ``turns`` for one of the joint, (n,), are known.
 
-        None where they leave a joint beyond its range, or the log is incomplete.
+        None if they leave a joint beyond its range, or the log is incomplete.
         """
         if (np.ptp(self.positions(positions) / turns, axis=0) > BEYOND * self.ranges).any():
             return None
@@ -125,7 +125,7 @@ class Logged:
         """Turns of each motor for one of its joint, by positions on the side of the motors.
 
         Weight goes with the sine of the joint's angle, so only the right reductions and zeros let
-        the drawing explain the drives. None where none do well.
+        the drawing explain the drives. None if none do well.
         """
         least = np.ptp(self.positions(positions), axis=0) / self.ranges
         moved, at_joint = least > BEYOND, np.ones(len(least))
@@ -185,7 +185,7 @@ class RobotColumns:
         columns: by name of joint or input; of what stands there no other column is thought.
         drives: by name of input, where drawing and log can be compared.
         gears: by joint whose position is that of a motor, its turns for one of the joint.
-        mounting: of the joints and the base against the drawing; None where nothing tells.
+        mounting: of the joints and the base against the drawing; None if nothing tells.
     """
 
     joints: Sequence[str] = ()
@@ -336,7 +336,7 @@ def _beyond_range(logged: Logged, positions: Group, of_joint: bool) -> list[str]
 
 
 def _turns(device: Device, robot: Robot) -> Array | None:
-    """Turns of each joint's motor for one of the joint (n,); None where motors turn several."""
+    """Turns of each joint's motor for one of the joint (n,); None if motors turn several."""
     turned = [list(motor.turns) for motor in robot.motors.values()]
     names = _joints(device)
     if not turned:

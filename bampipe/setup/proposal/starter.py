@@ -36,7 +36,7 @@ class Weight:
     Attributes:
         moments: guesses of what multiplies sine and cosine of the angle, in the drive's unit.
         sd: of both.
-        doubt: what else it may be, a clause; "" where there is no doubt.
+        doubt: what else it may be, a clause; "" if there is no doubt.
     """
 
     moments: tuple[float, float]
@@ -50,7 +50,7 @@ class Drive:
 
     Attributes:
         role: ``force``, ``current``, ``voltage`` or ``duty`` (cycle of a voltage).
-        column: that was recorded of it, "" where none was.
+        column: that was recorded of it, "" if none was.
         supply: whether the supply voltage that a duty cycle is a share of is recorded too.
         coil: whether, beside a force, the current of a coil that changes the friction is.
         scaled: whether what is recorded is a force or torque at the axis, no gain or lever missing.
@@ -66,7 +66,7 @@ class Drive:
 def weight_of(
     position: SurveyedColumn, fit: Driven, linear: bool, found: Survey, geared: bool
 ) -> tuple[Weight | None, str]:
-    """Gravity for the device file of an axis, None where it has none, and a sentence on it.
+    """Gravity for the device file of an axis, None if it has none, and a sentence on it.
 
     A joint whose mounting is not known is more likely to carry weight than not, and an axis
     whose model lacks gravity has its weight explained by springs and unbalance. Behind a gear of
@@ -115,7 +115,7 @@ def starter_device(
     Args:
         axis: its name, as one of several, behind which what belongs to it is called.
         found: sizes by a rough fit, SI, from which the priors are taken.
-        weight: gravity on the axis, None where it carries none.
+        weight: gravity on the axis, None if it carries none.
         sign_width: of the sign of the velocity, rad/s or m/s; 0 for the usual one.
     """
     taken = {*_NAMELESS, *FUNCTIONS}

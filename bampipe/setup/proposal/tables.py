@@ -1,4 +1,4 @@
-"""The tables of a proposal that say what its columns are, ``[time]`` to ``[channels]``."""
+"""The tables of a proposal that describe the columns, ``[time]`` to ``[channels]``."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -29,23 +29,23 @@ _LIKELY_RATE_HZ = 100.0
 _COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timesteps", "cyccnt"])
 """Words in the name of a clock that counts at a rate of its own."""
 _FRACTIONS = {"ns": 1e9, "us": 1e6, "ms": 1e3}
-"""Units of what stands on top of whole seconds, and how many make one."""
+"""Units of the fraction beside whole seconds, and how many make one second."""
 _MIXED = 0.1
 """Share of steps at which times fall that are all different, of rows that stand out of order."""
 _SLOW_HZ = 40.0
 """Below, accelerations of a joint that stops within a tenth of a second are not seen."""
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
 _SURE, _NEAR = 2.0, 0.025
-"""Standard errors, and share, within which a number that encoders have is what a turn counts."""
+"""Standard errors, and share, within which a usual number of counts is that of a turn."""
 _ROUND = [digits * 10.0**n for digits in (1, 2, 3.6, 4, 5, 8) for n in (3, 4)]
 _COUNTS = [*(2.0**n for n in range(8, 25)), *_ROUND]
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "kip", "V")
 _QUANTITY = {"N": "force", "N.m": "torque", "A": "current", "V": "voltage"}
 _MOST_VOLTS = 60.0
-"""Of a supply: servos count theirs in tenths."""
+"""Highest voltage of a supply: servos count theirs in tenths of a volt."""
 _FULL_DUTY = 1.05
-"""A duty cycle as a share goes to 1, and a little over by rounding."""
+"""Largest duty cycle as a share: 1, and a little more by rounding."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class ProposedClock:
     """The time of the first log, and how the session file says it.
 
     Attributes:
-        t: (T,) time stamps, s; columns: that the time takes up.
-        lines: of the table ``[time]``; rate: the line on the sample rate, above all tables.
+        t: (T,) time stamps, s; columns: those that hold the time.
+        lines: those of the table ``[time]``; rate: the line on the sample rate, above all tables.
     """
 
     t: np.ndarray
@@ -79,7 +79,7 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     topics = {c.name.partition(":")[0] for c in found.of("position") if c.name[:1] == "/"}
 
     def rank(c: SurveyedColumn) -> tuple[bool, bool, bool]:
-        # Motion that is interpolated is worse off than what drives it.
+        # Interpolation does the motion more harm than its drive.
         beside = c.name.partition(":")[0] in topics or not topics
         return c.name.endswith(_RECORDED), "stamp" not in words(c.name), not beside
 
@@ -123,7 +123,7 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
 
 
 def _fraction_of(seconds: SurveyedColumn, rest: SurveyedColumn) -> str:
-    """Unit of a column that starts again where whole seconds go on; "" where it does not."""
+    """Unit of a column that starts again where whole seconds go on; "" if it does not."""
     most, ahead = float(np.max(rest.values)), np.diff(seconds.values)
     # By its size, unless some milliseconds were lost or it is rounded to a few of them.
     kind = next((u for u, size in _FRACTIONS.items() if 0.5 * size < most < size), "")
@@ -135,7 +135,7 @@ def _fraction_of(seconds: SurveyedColumn, rest: SurveyedColumn) -> str:
 def _in_two_columns(
     seconds: SurveyedColumn, rest: SurveyedColumn, kind: str, notes: Notes
 ) -> ProposedClock:
-    """Whole seconds and what stands on top of them, as ROS and C have them."""
+    """Propose whole seconds and a column of their fractions, as in ROS and C."""
     t = seconds.values - seconds.values[0] + (rest.values - rest.values[0]) / _FRACTIONS[kind]
     note = notes.guess(f"whole seconds in {seconds.name}, {kind} on top in {rest.name}")
     whole = "datetime" if seconds.stated == "datetime" else "s"
@@ -146,7 +146,7 @@ def _in_two_columns(
 
 
 def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
-    """No column is a clock; a number beside the samples may give the rate."""
+    """Propose to count samples if no column is a clock; a number beside them may give the rate."""
     samples = np.arange(len(found.columns[0].values))
     constants = {c.name: float(c.values[0]) for c in found.columns if c.is_constant}
     steps = {name: interval_of(name, value) for name, value in constants.items()}
@@ -241,16 +241,14 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
         return _integrated(axis, column, match.notes)
     if in_counts(column):
         return _counted(axis, column, match)
-    worth = match.turning.get(column.name)
+    worth, said = match.turning.get(column.name), spelled(column.unit, _POSITION_UNITS)
     if worth is not None and column.si is not None:
         turns, sd = (column.scale * part for part in (worth.size, worth.sd))
-        said = spelled(column.unit, _POSITION_UNITS)
         fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
         fields += f", scale_sd = {_rounded(sd / turns)}"
         of = {"column": column.name, "axis": axis.name, "turns": turns, "sd": _rounded(sd)}
         return entry(column.name, said, fields) + match.notes.guess(sentence("geared", **of))
     if column.name == match.geared:
-        said = spelled(column.unit, _POSITION_UNITS)
         return entry(column.name, said, ", gear_ratio = 0.0") + match.notes.ask(
             "gear", axis=axis.name, column=column.name
         )
@@ -258,9 +256,9 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
     if column.si == "V":
         return entry(column.name, UNKNOWN) + match.notes.ask("volts_of_position", column.name)
     if (column.by_looks or column.is_foreign) and not right:
-        looks = f"which looks like the position of {axis.name}"
-        said = f"stated as '{column.stated}'" if column.is_foreign else looks
-        note = match.notes.ask("position_unit", f"{column.name}, {said}")
+        why = f"which looks like the position of {axis.name}"
+        why = f"stated as '{column.stated}'" if column.is_foreign else why
+        note = match.notes.ask("position_unit", f"{column.name}, {why}")
         return entry(column.name, UNKNOWN, _velocity_beside(axis, match)) + note
     if not right and worth is not None:
         return entry(column.name, UNKNOWN) + match.notes.ask(
@@ -268,7 +266,7 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
             sd=_rounded(worth.sd), turn=2.0 * np.pi * worth.size,
         )  # fmt: skip
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
-    said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
+    said = (said if right else by_size) or axis.unit
     fields, how = _counting(axis, said, match, match.robot.gears.get(axis.name, 1.0))
     fields += "" if geared else _velocity_beside(axis, match)
     guess = f"is the position of {axis.name}, in {said}" + (", by its size" if by_size else "")
@@ -283,9 +281,9 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
 
 
 def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -> tuple[str, str]:
-    """Fields of an encoder that counts otherwise than a robot's drawing, and that in words.
+    """Fields of an encoder that counts differently from a robot's drawing, and the same in words.
 
-    ``turns``: of what the encoder sits on, for one of the axis.
+    ``turns``: turns of the encoder's shaft for one of the axis.
     """
     direction, zero = match.robot.counting.get(axis.name, (1.0, 0.0))
     fields, ways = match.scale_sd.get(axis.name, ""), []
@@ -472,7 +470,7 @@ def _channels_table(
 
 
 def _channel(name: str, si: str, column: SurveyedColumn, why: str, match: Matcher) -> str:
-    """Column and unit of one input; its register or its scale, where the unit does not do."""
+    """Column and unit of one input; its register or its scale, if the unit is not enough."""
     register, notes = match.registers.get(column.name), match.notes
     fields = register.fields if register else ""
     turned = name in match.robot.turned or column.name == match.reacting
@@ -513,7 +511,7 @@ def _channel(name: str, si: str, column: SurveyedColumn, why: str, match: Matche
 
 
 def _unscaled(si: str, column: SurveyedColumn, register: Register | None) -> str:
-    """What to add of a column that may be in counts, or is a register."""
+    """Remark on a column that may be in counts, or is a register."""
     if register:
         return f", {register.words}: give its scale"
     counts = column.is_integer and not column.unit and si
