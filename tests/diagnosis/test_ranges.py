@@ -18,9 +18,9 @@ def range_of(effect, parameter, scale=AXIS):
 @pytest.mark.parametrize(
     ("effect", "parameter", "low", "high"),
     [
-        ("presliding:carriage", "distance", 25e-6, 0.03),
+        ("presliding:carriage", "distance", 25e-6, 0.025),
         ("flexible_load:carriage", "frequency", 25.0, 2.0 * np.pi * 24.0),
-        ("stribeck:carriage", "speed", 3e-4, 0.2),
+        ("stribeck:carriage", "speed", 6e-4, 0.15),
         ("torque_ripple:carriage", "wavenumber", 4 * np.pi / 0.25, 60 * np.pi / 0.25),
         ("transmission_compliance:carriage", "compliance", 2.5e-7, 2.5e-4),
         ("drive_sag:carriage", "sag", 1e-4, 0.03),
