@@ -64,7 +64,7 @@ def write_speed(path: Path) -> str:
 
 
 def write_rivals(path: Path) -> str:
-    """What other programs reach, beside what bampipe does on the same records."""
+    """Results of other programs beside those of bampipe on the same records."""
     files = (path, RESULTS / "emps.json", RESULTS / "measured_sets.json")
     stored = (json.loads(file.read_text(encoding="utf-8")) for file in files)
     return tables.write_rivals(*(content["result"] for content in stored))

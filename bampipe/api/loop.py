@@ -262,8 +262,10 @@ def _add(
     why = "the held-out error does not fall"
     if ladder[child].has_lost_its_floor(ladder[model]):
         why = "there is no noise floor, or the error is implausibly far below it"
-    tell(f"{', '.join(effects)}: {why}, stopped at {model}")
     axis_of = {row.effect: row.axis for row in run.read(DiagnoseResult, model).ranking}
     worse = ladder[child].axes_worse_than(ladder[model])
     helpful = tuple(effect for effect in effects if axis_of.get(effect) not in worse)
-    return _add(options, model, helpful, tell) if 0 < len(helpful) < len(effects) else ""
+    again = 0 < len(helpful) < len(effects)
+    then = "tried without those on axes whose error rises" if again else f"stopped at {model}"
+    tell(f"{', '.join(effects)}: {why}, {then}")
+    return _add(options, model, helpful, tell) if again else ""

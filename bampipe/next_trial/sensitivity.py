@@ -110,13 +110,15 @@ def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[Detec
     """
     criteria, found = comparison.session.criteria, []
     sure = norm.ppf(criteria.probability)
+    odds = log_prior(criteria, len(comparison.session.candidate_names(comparison.fit.spec)))
     remainders = comparison.find_remainders(sums)
     pairs = zip(comparison.alternatives, remainders, strict=True)
     for number, (alternative, left) in enumerate(pairs):
         expected = left.distance(sums.independent, _STRENGTHS)
         # The variance of a log likelihood ratio is twice its expectation.
         surely = expected - sure * np.sqrt(2.0 * expected)
-        excess = surely - needed - _find_penalty(comparison, sums, number)
+        further = (1 - alternative.items[0].combines) * odds
+        excess = surely - needed - further - _find_penalty(comparison, sums, number)
         enough = np.flatnonzero(excess >= 0.0)
         factor = float("inf")
         if enough.size:
@@ -144,10 +146,7 @@ def _find_penalty(comparison: Comparison, sums: Sums, number: int) -> Array:
     if alternative.slopes:
         information = information * np.outer(values[linear], values[linear])
     strengths = factors[:, None] * np.ones_like(typical)
-    session = comparison.session
-    odds = log_prior(session.criteria, len(session.candidate_names(comparison.fit.spec)))
-    further = (1 - item.combines) * odds
-    return further + penalise(information, spread, strengths, len(item.searched_indices))
+    return penalise(information, spread, strengths, len(item.searched_indices))
 
 
 def _cap_factor(factor: float) -> float:

@@ -145,7 +145,7 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
 def _sheet(file: BinaryIO) -> BinaryIO:
     """The sheets of a workbook that have the header of the longest, as CSV, one below the other.
 
-    Other columns of sheets with the same first column, as of times, stand beside these.
+    Sheets that share their first column, such as time, add their other columns to those.
     InputError without openpyxl.
     """
     book = need("openpyxl", "xlsx").load_workbook(file, read_only=True, data_only=True)
