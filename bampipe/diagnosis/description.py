@@ -18,6 +18,7 @@ from bampipe.diagnosis.shape import (
 from bampipe.results.diagnose import ResidualMap
 from bampipe.results.rounding import significant
 from bampipe.trials.linearisation import Linearisation
+from bampipe.trials.measured import trial_of_block
 
 _VARIABLE, _MENTIONED = 0.2, 0.005
 """Smallest share of a residual's variance that a variable must explain to name its shape, and to be
@@ -30,6 +31,11 @@ or opposite if it is negative."""
 _BUMP_HEIGHT, _BUMP_WIDTH = 0.5, 1.0 / 3.0
 """Share of the largest mean residual above which a bin belongs to a bump, and largest share of the
 range that a bump covers; a wider one is a broad change."""
+_CHANGED = 0.5
+"""Share that values by trial must explain for a change between trials to be named."""
+_SEEN = 0.01
+"""Least information on a parameter in a trial, as a share of that in the trial with most, for its
+value there to be mentioned."""
 _SIGNIFICANT = 0.01
 """Probability of reporting a vibration that is not there."""
 
@@ -51,6 +57,14 @@ def describe(linearisation: Linearisation, axis: int) -> str:
     best = int(np.argmax([m.variance_share for m in maps]))
     most, variable, share = maps[best], known[best], maps[best].variance_share
     unit = linearisation.system.torque_units[axis]
+    by_trial, differs = _by_trial(linearisation, axis)
+    if by_trial > max(share, _CHANGED):
+        return (
+            f"{differs}; this explains {100 * by_trial:.0f} % of the residual's variance. Some "
+            "condition that is not recorded changed between the trials, such as a current, a "
+            "payload or a temperature: record it as a channel, or make one session for each of its "
+            "values"
+        )
     if share < _VARIABLE or variable.name == "time":
         vibration = _vibration(linearisation, axis)
         if vibration is not None and vibration.share > max(share, _VARIABLE):
@@ -76,6 +90,37 @@ def describe(linearisation: Linearisation, axis: int) -> str:
             f"repeats every {period:.3g} {most.unit}, {turning}; {explains}"
         )
     return f"{_bumps(most, unit + ' near ' + variable.name)}, {turning}; {explains}"
+
+
+def _by_trial(linearisation: Linearisation, axis: int) -> tuple[float, str]:
+    """Return the parameter of the device whose values by trial would explain most of a residual.
+
+    Each is fitted alone.
+
+    Returns:
+        The share of the residual's variance that it explains, 0 to 1, and the range of its values.
+    """
+    e, trials = linearisation, [trial_of_block(m.trial_id) for m in linearisation.motions]
+    names = [*dict.fromkeys(trials)]
+    own = [k for k, i in enumerate(e.free) if i < len(e.system.model.device.parameters)]
+    moment, square = np.zeros((2, len(names), len(own)))
+    for trial, slopes, left in zip(trials, e.jacobian, e.residual, strict=True):
+        columns, row = slopes[:, axis][:, own], names.index(trial)
+        moment[row] += columns.T @ left[:, axis]
+        square[row] += np.sum(columns**2, axis=0)
+    taken = np.sum(moment**2 / np.maximum(square, 1e-300), axis=0)
+    best = int(np.argmax(taken))
+    number = e.free[own[best]]
+    parameter = e.system.parameters[number]
+    known = square[:, best] > _SEEN * square[:, best].max()
+    values = e.p[number] - moment[known, best] / square[known, best]
+    total = sum(float(left[:, axis] @ left[:, axis]) for left in e.residual)
+    ends = (
+        f"{significant(values[k], 2)} {parameter.unit}".strip() + f" in {np.array(names)[known][k]}"
+        for k in (int(np.argmin(values)), int(np.argmax(values)))
+    )
+    share = float(taken[best]) / max(total, 1e-300) if len(names) > 1 else 0.0
+    return share, f"{parameter.name} differs between trials, from {' to '.join(ends)}"
 
 
 def _bumps(most: ResidualMap, unit: str) -> str:

@@ -48,6 +48,17 @@ class SetEvidence:
 
 
 @dataclass(frozen=True)
+class FittedSet:
+    """A set that has been fitted: its log evidence over that of the most probable model, nats.
+
+    ``rows`` is its residual beyond the bias in units of that model's noise, by axis, each (n,).
+    """
+
+    gain: float
+    rows: Sequence[Array]
+
+
+@dataclass(frozen=True)
 class Probabilities:
     """Probabilities of sets, of effects, and of something unknown.
 
@@ -69,7 +80,13 @@ class Probabilities:
 
 
 def weigh_sets(
-    by_noise: SetCosts, fit: Fit, pool: Pool, given: Sequence[str], criteria: Criteria, seed: int
+    by_noise: SetCosts,
+    fit: Fit,
+    pool: Pool,
+    fitted: Mapping[tuple[str, ...], FittedSet],
+    given: Sequence[str],
+    criteria: Criteria,
+    seed: int,
 ) -> Probabilities:
     """Compute the probabilities of the sets of a pool and of unknown functions beside them.
 
@@ -79,17 +96,19 @@ def weigh_sets(
     Args:
         by_noise: costs of sets beside the most probable model; fit: that model.
         pool: sets near it, with costs by the noise.
+        fitted: those that have been fitted, by effects; their evidence is that of the fit.
         given: effects of the model diagnosed, which are not in question.
     """
     costs = by_noise.with_independent(fit.count_independent(criteria))
     # A fit may gain less than its linear problem promised, in the same proportion to the samples.
     fewer = costs.problem.independent.sum() / max(by_noise.problem.independent.sum(), 1e-300)
-    shortfall = {k: fewer * (c - by_noise.cost(k)) for c, k in pool.values()}
-    pool = {n: (costs.cost(k) + shortfall[k], k) for n, (_, k) in pool.items()}
-    none = costs.cost(())
+    by_fit = {pool[n][1]: one for n, one in fitted.items() if n in pool}
+    at_noise, none = by_noise.cost(()), costs.cost(())
+    shortfall = {k: fewer * (at_noise - by_noise.cost(k) - s.gain) for k, s in by_fit.items()}
     own = [e for e in costs.problem.absence if e not in given]
     bare = change_effects(fit.spec, own)
-    near = sorted((c, k) for c, k in pool.values() if c < none + _MARGIN and k)[:_MOST_SETS]
+    weighed = sorted((costs.cost(k) + shortfall.get(k, 0.0), k) for _, k in pool.values() if k)
+    near = [k for cost, k in weighed[:_MOST_SETS] if cost < none + _MARGIN]
     absent = [((f"-{e}", ()),) for e in own]
 
     def list_effects(keys: Sequence[Key]) -> tuple[str, ...]:
@@ -99,9 +118,9 @@ def weigh_sets(
     named = [
         SetEvidence(
             keys, list_effects(keys), None, none - costs.cost(keys) - shortfall.get(keys, 0.0),
-            _split_evidence(costs, keys, None, shortfall.get(keys, 0.0)),
+            _split_evidence(costs, keys, by_fit[keys].rows if keys in by_fit else ()),
         )
-        for keys in dict.fromkeys([(), *(k for _, k in near), *absent])
+        for keys in dict.fromkeys([(), *near, *absent])
         if np.isfinite(costs.cost(keys))
     ]  # fmt: skip
     sets = _compute_probabilities(named, seed)
@@ -123,11 +142,12 @@ def weigh_sets(
         if none - here.cost + more < costs.log_prior - _MARGIN:
             continue
         acting = [e for e in own if axis in acting_axes(bare, e)]
-        more_by_block = _split_evidence(by_noise, (), by_all) - _split_evidence(costs, (), here)
+        more_by_block = _split_evidence(by_noise, (), by_all.residual)
+        more_by_block -= _split_evidence(costs, (), here.residual)
         beside = [
             SetEvidence(
                 keys, list_effects(keys), axis, none - found.cost + more,
-                _split_evidence(costs, keys, found) + more_by_block,
+                _split_evidence(costs, keys, found.residual) + more_by_block,
             )
             for keys, found in _beside_unknown(costs, splines, here, acting)
         ]  # fmt: skip
@@ -258,26 +278,25 @@ def _beside_unknown(
 
 
 def _split_evidence(
-    costs: SetCosts, keys: tuple[Key, ...], unknown: Unknown | None, shortfall: float = 0.0
+    costs: SetCosts, keys: tuple[Key, ...], residual: Sequence[Array] = ()
 ) -> Array:
-    """Return the log evidence of a set over that of none, less ``shortfall``, by block, (n,)."""
-    p = costs.problem
-    before = costs.residual_rows(())
-    after = list(unknown.residual) if unknown else costs.residual_rows(keys)
-    w_before = costs.solve(()).weight
-    w_after = unknown.weight if unknown else costs.solve(keys).weight
-    volume = costs.volume_rows(keys)
+    """Return the log evidence of a set over that of none by block, up to a constant, nats, (n,).
+
+    ``residual`` is that of the set, by axis, each (n,); by default that of its linear problem.
+    """
+    p, before = costs.problem, costs.residual_rows(())
+    after, volume = residual or costs.residual_rows(keys), costs.volume_rows(keys)
     count = 1 + max((int(s.block.max()) for s in p.likelihood.samples if len(s.block)), default=0)
-    found = np.full(count, -shortfall / count)
+    found = np.zeros(count)
+    weights = [p.independent / _sum_squares(rows) for rows in (before, after)]
     for axis, here in enumerate(p.likelihood.samples):
         if not len(here.rows):
             continue
+        w_before, w_after = (weight[axis] for weight in weights)
         share = here.independent / len(here.rows)
-        scale = 0.5 * np.log(w_after[axis] / w_before[axis])
-        rows = share * scale + 0.5 * (
-            w_before[axis] * before[axis] ** 2 - w_after[axis] * after[axis] ** 2
-        )
-        found += np.bincount(here.block, rows + share * volume[axis], minlength=count)
+        rows = share * (volume[axis] + 0.5 * np.log(w_after / w_before))
+        rows = rows + 0.5 * (w_before * before[axis] ** 2 - w_after * after[axis] ** 2)
+        found += np.bincount(here.block, rows, minlength=count)
     return found
 
 

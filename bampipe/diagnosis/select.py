@@ -9,7 +9,12 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
-from bampipe.diagnosis.probability import Probabilities, compute_excess, weigh_sets
+from bampipe.diagnosis.probability import (
+    FittedSet,
+    Probabilities,
+    compute_excess,
+    weigh_sets,
+)
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Pool, Search
 from bampipe.diagnosis.session import (
@@ -159,7 +164,7 @@ def select_effects(
                 gains = {key[0]: none - cost for cost, key in beside}
             room = session.criteria.most_effects - len(current.spec.effects) + len(spec.effects)
             pool = _explore(search, room, deep=room if number == 0 else min(_MOST_ADDED, room))
-            moved, kept = None, dict[tuple[str, ...], float]()
+            moved, kept = None, dict[tuple[str, ...], FittedSet]()
             last |= number >= _MOST_ROUNDS - 1
             if not last:
                 # The bias of the present replicates may hide an effect that only its prior rejects.
@@ -176,14 +181,12 @@ def select_effects(
             if moved is None:
                 # The gain of a fitted set is that of its fit, not that of its linear problem.
                 pool = {
-                    n: (none - kept[n] if n in kept else c, k)
-                    for n, (c, k) in pool.items()
-                    if n in kept or c >= none - _LEAST_GAIN
+                    n: one for n, one in pool.items() if n in kept or one[0] >= none - _LEAST_GAIN
                 }
                 progress(0.9, "comparing the gains with those on replicates")
                 replicate_gains = search.replicate_gains()
                 probabilities = weigh_sets(
-                    search, current, pool, spec.effects, session.criteria, session.seed
+                    search, current, pool, kept, spec.effects, session.criteria, session.seed
                 )
                 if number < _MOST_ROUNDS:
                     moved = _leave_out(session, search, current, probabilities, spec.effects)
@@ -207,16 +210,16 @@ def _fit_better(
     better: Sequence[tuple[Key, ...]],
     fits: dict[frozenset[str], Fit | None],
     tell: Callable[[str], None],
-) -> tuple[Fit | None, dict[tuple[str, ...], float]]:
+) -> tuple[Fit | None, dict[tuple[str, ...], FittedSet]]:
     """Fit the sets ``better`` in turn until the fit of one is better than the current model.
 
     A set that fits held-out trials worse is not better, even if its log evidence is.
 
     Returns:
-        The better fit, if any, and the gains of the fits that are not better, nats, by effects.
+        The better fit, if any, and the fits that are not better, by effects.
     """
     broken: list[set[Key]] = []
-    kept: dict[tuple[str, ...], float] = {}
+    kept: dict[tuple[str, ...], FittedSet] = {}
     for keys in better:
         if added_effects(keys) and len(broken) >= _MOST_FITS and len(keys) >= min(map(len, broken)):
             continue
@@ -232,7 +235,8 @@ def _fit_better(
         if moved is not None:
             gain, held_out = gains_when_fitted(current, moved, search, keys)
             if gain <= _LEAST_GAIN:
-                kept[effect_names(keys)] = gain
+                rows = zip(moved.rows_beyond_bias, current.likelihood.root, strict=True)
+                kept[effect_names(keys)] = FittedSet(gain, [row * root for row, root in rows])
             elif held_out > -NOTICEABLE:
                 return moved, kept
         broken.append({*keys})

@@ -41,7 +41,8 @@ def variables(fitted: Sequence[ModelOnTrial], band: Band, axis: int) -> tuple[Va
     for index, here in enumerate(fitted):
         motion, memory = here.motion, here.memory
         kept = band.thinned_rows(len(motion.t))
-        load = here.applied[:, axis]
+        # The modelled load: the residual itself is a part of the measured one.
+        load = (here.applied - here.residual)[:, axis]
         since, distance = since_reversal(motion, axis)
         put("position", unit, motion.q[kept, axis])
         put("velocity", f"{unit}/s", motion.qd[kept, axis])

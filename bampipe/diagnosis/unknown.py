@@ -37,14 +37,12 @@ class Unknown:
     Attributes:
         cost: negative log evidence of the set with the function, as `SetCosts.cost`.
         residual: residual in units of the noise, by axis, each (n,).
-        weight: weight of the squares of each axis, (n_q,).
         share: share of the mean square of the axis' residual that the function explains.
         size: root mean square of the function over that of the applied force.
     """
 
     cost: float
     residual: tuple[Array, ...]
-    weight: Array
     share: float
     size: float
 
@@ -229,4 +227,4 @@ class _ModelWithout:
         before, after = self.before / root, left[axis] / root
         share = 1.0 - float(after @ after) / max(float(before @ before), 1e-300)
         size = float(np.sqrt(np.mean((before - after) ** 2))) / max(self.force, 1e-300)
-        return Unknown(one.cost, tuple(left), one.weight, share, size)
+        return Unknown(one.cost, tuple(left), share, size)

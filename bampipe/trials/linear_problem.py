@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -181,6 +182,7 @@ class LinearProblem:
     loose: Array | None = None
     no_delay: Mapping[int, float] = field(default_factory=dict)
     step_precision: Array | float = 0.0
+    _held: dict[Any, tuple[Array, Array]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def independent(self) -> Array:
@@ -242,9 +244,19 @@ class LinearProblem:
             values: values by index of the parameter.
             n: number of unknowns, the model's own first; by default these alone.
         """
+        nb, key = self.to_parameters.shape[1], tuple(values.items())
+        if key not in self._held:
+            self._held[key] = self._hold(values)
+        own_fixed, own_free = self._held[key]
+        n, m = nb if n is None else n, own_free.shape[1]
+        fixed, free = np.zeros(n), np.zeros((n, m + n - nb))
+        fixed[:nb], free[:nb, :m] = own_fixed, own_free
+        free[nb:, m:] = np.eye(n - nb)
+        return fixed, free
+
+    def _hold(self, values: Mapping[int, float]) -> tuple[Array, Array]:
+        """Return `hold` for the model's own unknowns."""
         nb, places = self.to_parameters.shape[1], list(values)
-        n = nb if n is None else n
-        fixed, free = np.zeros(n), np.eye(n)
         rows, wanted = self.to_parameters[places], np.array(list(values.values()))
         # Scale each row to its own unit; a row of zeros needs no constraint.
         norm = np.linalg.norm(rows, axis=1)
@@ -255,14 +267,10 @@ class LinearProblem:
             bound = u[:, int(np.sum(size > _LOOSE)) :].T
             rows, wanted = bound @ rows, bound @ wanted
         if not rows.size:
-            return fixed, free
+            return np.zeros(nb), np.eye(nb)
         u, size, vt = np.linalg.svd(rows)
         rank = int(np.sum(size > 1e-9 * max(float(size[0]), 1e-300)))
-        fixed[:nb] = vt[:rank].T @ ((u.T @ wanted)[:rank] / size[:rank])
-        free = np.zeros((n, n - rank))
-        free[:nb, : nb - rank] = vt[rank:].T
-        free[nb:, nb - rank :] = np.eye(n - nb)
-        return fixed, free
+        return vt[:rank].T @ ((u.T @ wanted)[:rank] / size[:rank]), vt[rank:].T
 
     def removal(self, effects: Iterable[str]) -> dict[int, float]:
         """Changes of the parameters, by index, that remove some of the model's effects."""
