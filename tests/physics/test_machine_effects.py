@@ -212,6 +212,27 @@ def test_a_flexible_load_is_rigid_below_its_frequency_and_left_behind_above_it()
 GAP, MASS, DRIVE, PUSH = 2e-3, 70.0, 25.0, 50.0
 
 
+@pytest.mark.parametrize("effect", ["flexible_load", "loose_load", "loose_drive"])
+def test_friction_behind_the_encoder_is_part_of_that_of_the_axis(effect):
+    """At one steady speed the axis has the same friction wherever it acts."""
+    system = compile_model(Model(registry.device("slider"), [f"{effect}:carriage"]))
+    own = f"{effect}.carriage."
+    behind = {own + "coulomb_behind": 0.4, own + "viscous_behind": 2.0, own + "frequency": 60.0}
+    behind |= {own + "share": 1.0, own + "inertia": 25.0, "mass": MASS}
+    names = {item.name for item in system.parameters}
+    values = with_values(system, {k: v for k, v in behind.items() if k in names})
+    t = np.arange(0.0, 3.0, 1e-3)[:, None]
+    q, qd, qdd = 0.2 * t, 0.2 + 0.0 * t, 0.0 * t
+    u = np.zeros((t.size, len(system.inputs)))
+    viscous, coulomb, offset = (
+        values[system.index(name)] for name in ("viscous.carriage", "coulomb.carriage", "offset")
+    )
+    u[:, system.inputs.index("force_motor")] = 0.2 * viscous + coulomb + offset
+    z = system.memory(q, qd, qdd, u, values, t[:, 0])
+    left = system.residual(q, qd, qdd, z, u, values)[:, 0]
+    assert np.abs(left[-1]) < 1e-2
+
+
 @pytest.mark.parametrize("effect", ["loose_load", "loose_drive"])
 def test_what_is_loose_flies_free_for_as_long_as_it_crosses_half_the_gap(effect):
     system = compile_model(Model(registry.device("slider"), [f"{effect}:carriage"]))
