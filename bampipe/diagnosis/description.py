@@ -109,6 +109,7 @@ def _by_trial(linearisation: Linearisation, axis: int) -> tuple[float, str]:
         moment[row] += columns.T @ left[:, axis]
         square[row] += np.sum(columns**2, axis=0)
     taken = np.sum(moment**2 / np.maximum(square, 1e-300), axis=0)
+    taken -= moment.sum(axis=0) ** 2 / np.maximum(square.sum(axis=0), 1e-300)
     best = int(np.argmax(taken))
     number = e.free[own[best]]
     parameter = e.system.parameters[number]

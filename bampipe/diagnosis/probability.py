@@ -118,7 +118,7 @@ def weigh_sets(
     named = [
         SetEvidence(
             keys, list_effects(keys), None, none - costs.cost(keys) - shortfall.get(keys, 0.0),
-            _split_evidence(costs, keys, by_fit[keys].rows if keys in by_fit else ()),
+            split_evidence(costs, keys, by_fit[keys].rows if keys in by_fit else ()),
         )
         for keys in dict.fromkeys([(), *near, *absent])
         if np.isfinite(costs.cost(keys))
@@ -142,12 +142,12 @@ def weigh_sets(
         if none - here.cost + more < costs.log_prior - _MARGIN:
             continue
         acting = [e for e in own if axis in acting_axes(bare, e)]
-        more_by_block = _split_evidence(by_noise, (), by_all.residual)
-        more_by_block -= _split_evidence(costs, (), here.residual)
+        more_by_block = split_evidence(by_noise, (), by_all.residual)
+        more_by_block -= split_evidence(costs, (), here.residual)
         beside = [
             SetEvidence(
                 keys, list_effects(keys), axis, none - found.cost + more,
-                _split_evidence(costs, keys, found.residual) + more_by_block,
+                split_evidence(costs, keys, found.residual) + more_by_block,
             )
             for keys, found in _beside_unknown(costs, splines, here, acting)
         ]  # fmt: skip
@@ -277,9 +277,7 @@ def _beside_unknown(
         keys = best[0]
 
 
-def _split_evidence(
-    costs: SetCosts, keys: tuple[Key, ...], residual: Sequence[Array] = ()
-) -> Array:
+def split_evidence(costs: SetCosts, keys: tuple[Key, ...], residual: Sequence[Array] = ()) -> Array:
     """Return the log evidence of a set over that of none by block, up to a constant, nats, (n,).
 
     ``residual`` is that of the set, by axis, each (n,); by default that of its linear problem.

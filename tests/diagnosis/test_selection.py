@@ -7,6 +7,7 @@ import pytest
 from sessions import TRUTH, bam, fit_from_priors, made
 
 from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.probability import split_evidence
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import open_search, select_effects, start_of
 from bampipe.diagnosis.session import Session, system_of
@@ -124,3 +125,13 @@ def test_an_effect_of_the_model_that_is_not_there_is_taken_away(session):
     without = [n for n in session.candidate_names(spec) if n not in (*EFFECTS, *OTHERS)]
     found = select_effects(session, spec, start, without)
     assert {*found.final.spec.effects} == {*EFFECTS}
+
+
+def test_the_evidence_of_a_fitted_set_comes_from_where_its_fit_gains(search):
+    keys = best_set(search, 3)
+    promised = split_evidence(search, keys)
+    assert promised == pytest.approx(split_evidence(search, keys, search.residual_rows(keys)))
+    assert promised.sum() > 100.0
+    # A fit that leaves what there was gains nowhere, whatever the linear problem promised.
+    left = split_evidence(search, keys, search.residual_rows(()))
+    assert np.abs(left).max() < 1e-6
