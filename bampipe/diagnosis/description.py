@@ -32,7 +32,11 @@ _BUMP_HEIGHT, _BUMP_WIDTH = 0.5, 1.0 / 3.0
 """Share of the largest mean residual above which a bin belongs to a bump, and largest share of the
 range that a bump covers; a wider one is a broad change."""
 _CHANGED = 0.5
-"""Share that values by trial must explain for a change between trials to be named."""
+"""Share that values by trial must explain for something to have changed between the trials."""
+_UNRECORDED = (
+    ". Some condition that is not recorded changed between the trials, such as a current, a payload"
+    " or a temperature: record it as a channel, or make one session for each of its values"
+)
 _SEEN = 0.01
 """Least information on a parameter in a trial, as a share of that in the trial with most, for its
 value there to be mentioned."""
@@ -58,13 +62,9 @@ def describe(linearisation: Linearisation, axis: int) -> str:
     most, variable, share = maps[best], known[best], maps[best].variance_share
     unit = linearisation.system.torque_units[axis]
     by_trial, differs = _by_trial(linearisation, axis)
-    if by_trial > max(share, _CHANGED):
-        return (
-            f"{differs}; this explains {100 * by_trial:.0f} % of the residual's variance. Some "
-            "condition that is not recorded changed between the trials, such as a current, a "
-            "payload or a temperature: record it as a channel, or make one session for each of its "
-            "values"
-        )
+    if by_trial > max(share, _VARIABLE):
+        said = f"{differs}; this explains {100 * by_trial:.0f} % of the residual's variance"
+        return said + (_UNRECORDED if by_trial > _CHANGED else "")
     if share < _VARIABLE or variable.name == "time":
         vibration = _vibration(linearisation, axis)
         if vibration is not None and vibration.share > max(share, _VARIABLE):
