@@ -113,8 +113,8 @@ def _by_trial(linearisation: Linearisation, axis: int) -> tuple[float, str]:
     best = int(np.argmax(taken))
     number = e.free[own[best]]
     parameter = e.system.parameters[number]
-    known = square[:, best] > _SEEN * square[:, best].max()
-    values = e.p[number] - moment[known, best] / square[known, best]
+    known = square[:, best] >= _SEEN * square[:, best].max()
+    values = e.p[number] - moment[known, best] / np.maximum(square[known, best], 1e-300)
     total = sum(float(left[:, axis] @ left[:, axis]) for left in e.residual)
     ends = (
         f"{significant(values[k], 2)} {parameter.unit}".strip() + f" in {np.array(names)[known][k]}"

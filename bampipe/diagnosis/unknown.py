@@ -27,7 +27,7 @@ _SIZES = (0.003, 0.01, 0.03, 0.1)
 _FEWEST_PERIODS = 2
 """Of a vibration, in the longest trial."""
 _REWEIGHTS = 2
-"""Reweighting steps, from the weights of the function with one spline less."""
+"""Reweighting steps of the best spline, from the weights of the function with one spline less."""
 
 
 @dataclass(frozen=True)
@@ -189,34 +189,41 @@ class _ModelWithout:
             if function not in sizes
             for size in _SIZES
         ]
-        return min((self.solve(one, weight) for one in wider), key=lambda one: one.cost)
+        taken = self._take_model(weight)
+        ranked = (self._solve(one, weight, taken) for one in wider)
+        best = min(ranked, key=lambda one: one.cost)
+        for _ in range(_REWEIGHTS - 1):
+            best = self._solve(best.sizes, best.weight, self._take_model(best.weight))
+        return best
 
-    def solve(self, sizes: dict[int, float], weight: Array) -> _Solution:
-        """Return the solution with splines of given sizes, from initial weights of the axes."""
+    def _take_model(self, weight: Array) -> Array:
+        """Return what the model takes of each column and of the residual, (nb, m + 1)."""
+        own = np.tensordot(weight, self.bb, 1) + self.precision
+        right = [weight[self.splines.axis] * self.bx, self.moment - weight @ self.by]
+        return solve_scaled(own, np.column_stack(right))
+
+    def _solve(self, sizes: dict[int, float], weight: Array, all_taken: Array) -> _Solution:
+        """Return the solution with splines of given sizes at weights of the axes."""
         p, axis, functions = self.p, self.splines.axis, self.splines.functions
         at = np.concatenate([functions[k] for k in sizes])
         known = np.concatenate(
             [np.full(len(functions[k]), (size * self.force) ** -2) for k, size in sizes.items()]
         )
         bx, xx, xy = self.bx[:, at], self.xx[np.ix_(at, at)], self.xy[at]
-        for _ in range(_REWEIGHTS):
-            own, w = np.tensordot(weight, self.bb, 1) + self.precision, weight[axis]
-            right = np.column_stack([w * bx, self.moment - weight @ self.by])
-            taken = solve_scaled(own, right)
-            inside = w * xx - w * bx.T @ taken[:, :-1]
-            c = solve_scaled(inside + np.diag(known), -w * xy - w * bx.T @ taken[:, -1])
-            b = taken[:, -1] - taken[:, :-1] @ c
-            squares = self.yy + 2.0 * self.by @ b + (self.bb @ b) @ b
-            squares[axis] += 2.0 * (xy + bx.T @ b) @ c + c @ xx @ c
-            left = np.maximum(squares, 1e-9 * self.yy + 1e-300)
-            weight = p.independent / left
+        taken, alone, w = all_taken[:, at], all_taken[:, -1], weight[axis]
+        inside = w * xx - w * bx.T @ taken
+        c = solve_scaled(inside + np.diag(known), -w * xy - w * bx.T @ alone)
+        b = alone - taken @ c
+        squares = self.yy + 2.0 * self.by @ b + (self.bb @ b) @ b
+        squares[axis] += 2.0 * (xy + bx.T @ b) @ c + c @ xx @ c
+        left = np.maximum(squares, 1e-9 * self.yy + 1e-300)
         moved = self.fixed + self.free @ b
         cost = p.fixed_cost + 0.5 * float(p.independent @ np.log(left / p.count))
         cost += 0.5 * float(moved @ p.precision @ moved) - float(p.moment @ moved)
         cost += 0.5 * float(c @ (known * c))
         cost += 0.5 * float(np.linalg.slogdet(np.eye(len(at)) + inside / known)[1])
         cost += float(self.splines.log_choices[list(sizes)].sum()) + self.penalty
-        return _Solution(sizes, cost, b, c, weight)
+        return _Solution(sizes, cost, b, c, p.independent / left)
 
     def describe(self, one: _Solution) -> Unknown:
         """Describe the sum of the splines of a solution."""

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from bampipe.arrays import Array, Flags, Indices
 from bampipe.physics.parameter import Parameter
@@ -360,6 +361,7 @@ def solve_bounded(
         expected: prior precision of the other unknowns about zero, (n - P, n - P).
     """
     p, n = problem, xx.shape[1]
+    flat = xx.reshape(len(xx), -1)
     nb, independent = p.to_parameters.shape[1], p.independent
     low = np.zeros(0) if low is None else low
     high = np.zeros(0) if high is None else high
@@ -374,7 +376,7 @@ def solve_bounded(
         fixed[nb:] = bound
         chosen = free[:, np.append(np.ones(free.shape[1] - n + nb, dtype=bool), ~held)]
         for _ in range(_REWEIGHTS):
-            normal = np.tensordot(weight, xx, 1) + precision
+            normal = (weight @ flat).reshape(n, n) + precision
             right = moment - weight @ xy - normal @ fixed
             b = fixed + chosen @ solve_scaled(chosen.T @ normal @ chosen, chosen.T @ right)
             left = np.maximum(yy + 2.0 * xy @ b + (xx @ b) @ b, 1e-12 * yy)
@@ -404,4 +406,6 @@ def solve_scaled(normal: Array, right: Array) -> Array:
     scaled = normal * size * size[:, None]
     scaled.flat[:: len(scaled) + 1] += _RIDGE
     by = size if right.ndim == 1 else size[:, None]
-    return np.asarray(np.linalg.solve(scaled, right * by) * by)
+    _, found, failed = dposv(scaled, right * by)
+    # Rounding may take the least eigenvalue below zero.
+    return np.asarray((np.linalg.solve(scaled, right * by) if failed else found) * by)

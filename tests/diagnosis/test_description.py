@@ -22,3 +22,5 @@ def test_a_parameter_that_differs_between_trials_is_named_with_its_values():
     assert said.startswith(f"coulomb.pitch differs between trials, {ends}; this explains 100 %")
     same = replace(found, residual=[x[:, :, place] for x in found.jacobian])
     assert "differs" not in describe(same, axis)
+    alone = [replace(motion, trial_id="t01") for motion in found.motions]
+    assert "differs" not in describe(replace(changed, motions=alone), axis)
