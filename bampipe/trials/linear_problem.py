@@ -406,6 +406,8 @@ def solve_scaled(normal: Array, right: Array) -> Array:
     scaled = normal * size * size[:, None]
     scaled.flat[:: len(scaled) + 1] += _RIDGE
     by = size if right.ndim == 1 else size[:, None]
-    _, found, failed = dposv(scaled, right * by)
-    # Rounding may take the least eigenvalue below zero.
+    failed = not scaled.size
+    if not failed:
+        _, found, failed = dposv(scaled, right * by)
+    # LAPACK takes nothing empty, and rounding may take the least eigenvalue below zero.
     return np.asarray((np.linalg.solve(scaled, right * by) if failed else found) * by)

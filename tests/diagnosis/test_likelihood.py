@@ -10,7 +10,12 @@ from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.identification.least_squares_estimate import fit_squares
 from bampipe.trials.likelihood import Likelihood
-from bampipe.trials.linear_problem import LinearProblem, pose_problem, solve_bounded
+from bampipe.trials.linear_problem import (
+    LinearProblem,
+    pose_problem,
+    solve_bounded,
+    solve_scaled,
+)
 from bampipe.trials.samples import Noise, Samples, describe_noise, take_samples
 
 pytest_plugins = ("recorded",)
@@ -163,6 +168,13 @@ def test_what_is_taken_away_changes_the_rest_unless_another_parameter_replaces_i
     assert held.hold({1: -3.0})[1].shape == (2, 1)
     _, free = loose.hold({1: -3.0, 2: 0.0})
     assert free.shape == (2, 1) and free[1, 0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_normal_equations_of_nothing_and_of_a_negative_eigenvalue_are_solved():
+    assert solve_scaled(np.zeros((0, 0)), np.zeros(0)).shape == (0,)
+    assert solve_scaled(np.zeros((0, 0)), np.zeros((0, 3))).shape == (0, 3)
+    indefinite = np.array([[4.0, 10.0], [10.0, 4.0]])
+    np.testing.assert_allclose(solve_scaled(indefinite, np.array([14.0, 14.0])), 1.0, rtol=1e-6)
 
 
 def test_a_few_samples_that_no_replicate_has_do_not_decide_under_heavy_tails(line):
