@@ -31,7 +31,8 @@ class _Writer:
         names: the drawing's name of each coordinate's joint.
         armature: inertia of each joint's drives, less the part in tendons.
         add: elements of the MJCF; lacks: effects that cannot be expressed, and other differences.
-        friction: each joint's Coulomb friction that no bristle has taken.
+        friction, damping: each joint's Coulomb and viscous friction that no bristle or load has
+            taken.
         springs: coefficients of position, its square and cube by joint, N.m or N.
         drives: gain, offset, delay and lag between each drive's input and its joint.
     """
@@ -44,6 +45,7 @@ class _Writer:
     add: Additions = field(default_factory=Additions)
     lacks: list[str] = field(default_factory=list)
     friction: dict[str, float] = field(default_factory=dict)
+    damping: dict[str, float] = field(default_factory=dict)
     springs: dict[str, Array] = field(default_factory=dict)
     drives: dict[str, dict[str, float]] = field(default_factory=dict)
 
@@ -77,8 +79,12 @@ class _Writer:
         return self.drives.setdefault(force, {**_AS_LOGGED})
 
     def remaining_friction(self, axis: str) -> float:
-        """Return the Coulomb friction of a joint that no bristle has taken."""
+        """Return the Coulomb friction of a joint that no bristle or load has taken."""
         return self.friction.get(axis, self.value(f"coulomb.{axis}"))
+
+    def remaining_damping(self, axis: str) -> float:
+        """Return the viscous friction of a joint that no load has taken."""
+        return self.damping.get(axis, self.value(f"viscous.{axis}"))
 
     def write(self, item: BoundEffect) -> None:
         """Add one effect, or note that it cannot be expressed."""
@@ -104,6 +110,9 @@ class _Writer:
             self.set_joint(axis, armature=inertia)
         for axis, c in self.friction.items():
             self.set_joint(axis, frictionloss=c)
+        for axis, c in self.damping.items():
+            if "damping" not in self.add.joints.get(self.names[axis], {}):
+                self.set_joint(axis, damping=c)
         for axis, numbers in self.springs.items():
             self.set_joint(axis, stiffness=numbers)
         for axis in self.system.coordinates:
@@ -133,7 +142,7 @@ def _spring(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
 
 
 def _drag(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
-    linear = max(w.value(f"viscous.{item.target}"), 0.0)
+    linear = max(w.remaining_damping(item.target), 0.0)
     w.set_joint(item.target, damping=np.array([linear, v.coefficient, 0.0]))
     return True
 
@@ -147,6 +156,14 @@ def _stop(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
 def _load(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
     axis, half = item.target, 0.5 * getattr(v, "gap", 0.0)
     load = f"load_{w.names[axis]}"
+    behind = (getattr(v, f"{what}_behind", 0.0) for what in ("coulomb", "viscous"))
+    dry, viscous = (v.inertia * each for each in behind)
+    if dry > w.remaining_friction(axis) or viscous > max(w.remaining_damping(axis), 0.0):
+        return False
+    if dry or viscous:
+        w.friction[axis] = w.remaining_friction(axis) - dry
+        w.damping[axis] = w.remaining_damping(axis) - viscous
+        w.add_tendon({load: 1.0}, damping=viscous, frictionloss=dry)
     kind = next(c.kind for c in w.system.model.device.coordinates if c.name == axis)
     w.add.loads.append((load, "slide" if kind == "linear" else "hinge", v.inertia))
     w.add_tendon(
@@ -238,8 +255,9 @@ def add_effects(
         drives: inertia of the drives at each joint, (n_q,).
     """
     writer = _Writer(system, p, robot, names, dict(zip(system.coordinates, drives, strict=True)))
-    # Presliding takes its part of the friction before Stribeck friction takes the rest.
-    for item in sorted(system.model.effects, key=lambda item: item.effect.name == "stribeck"):
+    # A load takes its part of the friction first, and Stribeck friction what is left at last.
+    order = {"flexible_load": -1, "stribeck": 1}
+    for item in sorted(system.model.effects, key=lambda item: order.get(item.effect.name, 0)):
         writer.write(item)
     writer.finish()
     return writer.add, writer.lacks
