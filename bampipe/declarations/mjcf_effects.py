@@ -31,8 +31,7 @@ class _Writer:
         names: the drawing's name of each coordinate's joint.
         armature: inertia of each joint's drives, less the part in tendons.
         add: elements of the MJCF; lacks: effects that cannot be expressed, and other differences.
-        friction, damping: each joint's Coulomb and viscous friction that no bristle or load has
-            taken.
+        friction: each joint's Coulomb friction that no bristle or load has taken.
         springs: coefficients of position, its square and cube by joint, N.m or N.
         drives: gain, offset, delay and lag between each drive's input and its joint.
     """
@@ -45,7 +44,6 @@ class _Writer:
     add: Additions = field(default_factory=Additions)
     lacks: list[str] = field(default_factory=list)
     friction: dict[str, float] = field(default_factory=dict)
-    damping: dict[str, float] = field(default_factory=dict)
     springs: dict[str, Array] = field(default_factory=dict)
     drives: dict[str, dict[str, float]] = field(default_factory=dict)
 
@@ -84,7 +82,8 @@ class _Writer:
 
     def remaining_damping(self, axis: str) -> float:
         """Return the viscous friction of a joint that no load has taken."""
-        return self.damping.get(axis, self.value(f"viscous.{axis}"))
+        known = self.add.joints.get(self.names[axis], {})
+        return float(known.get("damping", self.value(f"viscous.{axis}")))
 
     def write(self, item: BoundEffect) -> None:
         """Add one effect, or note that it cannot be expressed."""
@@ -110,9 +109,6 @@ class _Writer:
             self.set_joint(axis, armature=inertia)
         for axis, c in self.friction.items():
             self.set_joint(axis, frictionloss=c)
-        for axis, c in self.damping.items():
-            if "damping" not in self.add.joints.get(self.names[axis], {}):
-                self.set_joint(axis, damping=c)
         for axis, numbers in self.springs.items():
             self.set_joint(axis, stiffness=numbers)
         for axis in self.system.coordinates:
@@ -162,7 +158,7 @@ def _load(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
         return False
     if dry or viscous:
         w.friction[axis] = w.remaining_friction(axis) - dry
-        w.damping[axis] = w.remaining_damping(axis) - viscous
+        w.set_joint(axis, damping=w.remaining_damping(axis) - viscous)
         w.add_tendon({load: 1.0}, damping=viscous, frictionloss=dry)
     kind = next(c.kind for c in w.system.model.device.coordinates if c.name == axis)
     w.add.loads.append((load, "slide" if kind == "linear" else "hinge", v.inertia))
