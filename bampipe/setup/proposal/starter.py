@@ -15,16 +15,15 @@ from bampipe.data.vocabulary import word_set
 from bampipe.physics.device import KINDS
 from bampipe.physics.expression import FUNCTIONS
 from bampipe.setup.hypotheses import MOST_TRAVEL
-from bampipe.setup.proposal.positions import in_counts
+from bampipe.setup.proposal.positions import SLIDING, TURNING, in_counts
 from bampipe.setup.sentences import sentence
 
 _NAMELESS = word_set("nameless")
 _FROM_A_MOTOR, _FROM_A_SENSOR = REFERENCE_WORDS | word_set("driven"), word_set("sensed")
-_ON_A_BENCH = word_set("sliding")
 _FASTEST_S = 2e-4
 """Time in which viscous friction stops the least mass that a simulation is asked to follow, s."""
 _YIELDS = 2e-3
-_ANGLES, _UPRIGHT = map(word_set, ("turning", "upright"))
+_UPRIGHT = word_set("upright")
 _LEAST_WEIGHT, _USUAL_GEAR = 1e-3, 10.0
 """Spread of a weight of which nothing shows, N.m; turns of a motor whose gear is not known."""
 
@@ -92,7 +91,7 @@ def weight_of(
 def _may_carry(position: SurveyedColumn, found: Survey, geared: bool) -> bool:
     """Whether an axis whose drive shows no weight is a joint all the same."""
     said, turns = set(words(re.sub(r"[\[\]]", " ", position.name))), position.si == "rad"
-    is_angle = turns or said & _ANGLES or any(c.si == "N.m" for c in found.of("force"))
+    is_angle = turns or said & TURNING or any(c.si == "N.m" for c in found.of("force"))
     if not is_angle or said & _UPRIGHT:
         return False
     travel = float(np.ptp(position.values)) * (position.scale if turns else 1.0)
@@ -136,7 +135,7 @@ def starter_device(
         rubbed = f" - abs(coil_current)*(friction_per_ampere*sgn({qd}) + viscous_per_ampere*{qd})"
         width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
     stated = drive.role != "force" or not _FROM_A_MOTOR.isdisjoint(words(drive.column))
-    bench = drive.coil or not _ON_A_BENCH.isdisjoint(words(position))
+    bench = drive.coil or not SLIDING.isdisjoint(words(position))
     # Most axes whose log names neither are driven, and the effects of drives are then candidates.
     motor = stated or not (bench or not _FROM_A_SENSOR.isdisjoint(words(drive.column)))
     listed, driven = " and ".join(constants), "driven" if motor else "prescribed"
