@@ -18,7 +18,7 @@ from bampipe.cli.options import (
     RunsOption,
     StageOptions,
 )
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import BASE, RunFolder
 from bampipe.errors import InputError
 
 
@@ -176,7 +176,7 @@ def demo(runs: RunsOption = RUNS, force: ForceOption = False, quiet: QuietOption
     with show.Watcher(quiet) as watcher:
         show.say(f"1. {session}: an arm with a fault that its model lacks.")
         run_session(replace(request, session=session, judge=True), watcher)
-        for axis, error in run.read(ValidateResult, models.BASE).axes.items():
+        for axis, error in run.read(ValidateResult, BASE).axes.items():
             show.say(
                 f"   {axis}: error on unseen trials {error.held_out_rmse:.3g} {error.unit}, "
                 f"sensor noise alone would leave {error.noise_floor:.3g} {error.unit}"
@@ -185,7 +185,7 @@ def demo(runs: RunsOption = RUNS, force: ForceOption = False, quiet: QuietOption
             "2. Which effect is missing? Diagnose and extend the model until nothing is missing."
         )
         options = LoopOptions(replace(request, pipeline=complete), watcher)
-        last = follow(options, models.BASE, lambda line: show.say(f"   {line}"))
+        last = follow(options, BASE, lambda line: show.say(f"   {line}"))
         show.say("3. The error on unseen trials, model by model.")
         for rung in run.read(CompareResult).ladder:
             errors = ", ".join(
