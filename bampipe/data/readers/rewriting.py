@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import count, pairwise
 from typing import Any
 
-from bampipe.data.readers.dialect import cells
+from bampipe.data.readers.header import cells
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER
 from bampipe.data.units import unit

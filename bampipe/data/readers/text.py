@@ -19,7 +19,8 @@ import pyarrow.csv as pa_csv
 
 from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments, rewriting
-from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
+from bampipe.data.readers.dialect import TableLayout
+from bampipe.data.readers.header import HEAD, NULLS, Line
 from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, need, opened
 from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError, located
@@ -74,14 +75,8 @@ def columns(path: Path, dialect: Dialect | None = None) -> dict[str, str]:
 
 
 def above_samples(path: Path) -> str:
-    """The text above the samples of a table.
-
-    Raises:
-        InputError: it is not a table.
-    """
+    """The text above the samples of a table."""
     head, dialect = _rewritten_head(path, Dialect())
-    if dialects.share_of_rows(head) < _LEAST_ROWS:
-        raise InputError("not a table")
     start = dialects.find_layout(head, (), dialect).start
     return head[:start].decode("utf-8", "replace")
 
