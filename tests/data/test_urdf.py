@@ -1,7 +1,6 @@
 """URDF files: chains, what hangs beside them, and what is refused, with a remedy."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -294,17 +293,6 @@ def test_a_session_depends_on_its_urdf(tmp_path: Path) -> None:
     write(tmp_path, *ARM, link("weight", 3.0), joint("grip", "tool", "weight", "fixed"))
     after = digest_session(tmp_path)
     assert {name for name in after if after[name] != before[name]} == {"session:arm.urdf"}
-
-
-def test_an_encoder_that_reads_two_joints_gives_the_position_of_its_own() -> None:
-    from bampipe.data.quality.channels import part_readings
-
-    reads = {"one": {}, "two": {"one": 1.0}}
-    encoders = [SimpleNamespace(name=name, also_reads=also) for name, also in reads.items()]
-    si = {"q_one": np.array([0.1, 0.2]), "q_two": np.array([0.4, 0.7])}
-    part_readings(SimpleNamespace(encoders=encoders), si)  # type: ignore[arg-type]
-    np.testing.assert_allclose(si["q_one"], [0.1, 0.2])
-    np.testing.assert_allclose(si["q_two"], [0.3, 0.5])
 
 
 FOLLOWS = '<mimic joint="{}" multiplier="{}" offset="{}"/></joint>'
