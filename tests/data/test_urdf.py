@@ -286,13 +286,16 @@ def test_gravity_is_that_of_the_root_above_the_base(
     assert given.robot.gravity == (0.0, 9.81, 0.0)
 
 
-def test_a_session_depends_on_its_urdf(tmp_path: Path) -> None:
+def test_a_session_depends_on_its_urdf_and_on_parts_of_its_trials(tmp_path: Path) -> None:
     device_of(tmp_path)
-    (tmp_path / "session.toml").write_text('device = "device.toml"\n')
+    trials = '[[trials]]\nfile = "a.csv"\n[[trials.parts]]\nfile = "./b.csv"\n'
+    (tmp_path / "session.toml").write_text(f'device = "device.toml"\n{trials}')
     before = digest_session(tmp_path)
     write(tmp_path, *ARM, link("weight", 3.0), joint("grip", "tool", "weight", "fixed"))
+    (tmp_path / "b.csv").write_text("t,u\n")
     after = digest_session(tmp_path)
-    assert {name for name in after if after[name] != before[name]} == {"session:arm.urdf"}
+    changed = {name for name in after if after[name] != before[name]}
+    assert changed == {"session:arm.urdf", "session:./b.csv"}
 
 
 FOLLOWS = '<mimic joint="{}" multiplier="{}" offset="{}"/></joint>'
