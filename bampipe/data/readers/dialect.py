@@ -13,7 +13,6 @@ from itertools import zip_longest
 import numpy as np
 
 from bampipe.data.readers.header import (
-    COMMA,
     DELIMITERS,
     NULLS,
     POINT,
@@ -23,13 +22,11 @@ from bampipe.data.readers.header import (
     Line,
     are_units,
     cells,
-    filled,
+    count_readings,
     find_header,
     find_starts,
     is_number,
-    is_reading,
     is_remark,
-    is_word,
     of_properties,
     split_lines,
     without_mark,
@@ -41,6 +38,7 @@ from bampipe.errors import InputError
 
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+\Z")
 _GROUPED = re.compile(r"[-+]?(\d{1,3}(,\d{3})+\.\d*|\d{1,3}(\.\d{3})+,\d*)\Z")
+_WORD = re.compile(r"[^\W\d_]{2}")
 _UNIT = re.compile(r"[\[(]?\s*(?=.*[A-Za-z%°Ωµμ#1\-])[A-Za-z0-9%°Ωµμ#./*^²³· _\-]{0,16}\s*[\])]?\Z")
 _MOTION = re.compile(r"(?i)\binDegrees\s*=\s*yes\b")
 _NO_ANGLE = re.compile(
@@ -83,17 +81,17 @@ class TableLayout:
 
     def is_remark(self, text: str) -> bool:
         """Whether a line begins with a word, where samples begin with a number or a time."""
-        return is_remark(text) or is_word(next(iter(self.cells(text)), ""))
+        return is_remark(text) or _WORD.match(next(iter(self.cells(text)), "")) is not None
 
     def ends_in_words(self, text: str) -> bool:
         """Whether words, such as what an operator noted, stand behind the last cell of a line."""
         behind = [cell for cell in self.cells(text)[len(self.header) :] if cell]
-        return bool(behind) and all(map(is_word, behind))
+        return bool(behind) and all(map(_WORD.match, behind))
 
     def is_chatter(self, text: str) -> bool:
         """Whether a line among the samples is text without a number in any cell, or ends in it."""
         row = [cell for cell in self.cells(text) if cell not in NULLS]
-        count = sum(is_reading(cell, self.decimal) for cell in row)
+        count = count_readings(row)
         # The title of a block may hold its number.
         titled = len(self.cells(text)) != len(self.header) and self.is_remark(text)
         plain = 2 * count < len(row) if titled else not count
@@ -110,15 +108,15 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
         InputError: no header, a column missing, or a layout that can be read in two ways.
     """
     lines = split_lines(head)
-    if not filled(lines):
+    if not lines:
         raise InputError("the file holds no text")
     header = find_header(lines, columns, dialect)
     delimiter, given = header.delimiter, bool(dialect.names)
     remarks = []
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
-    if passed := len(filled(lines[: max(header.at, 0)])):
-        remarks.append(f"{passed} lines above the header passed over")
+    if header.at > 0:
+        remarks.append(f"{header.at} lines above the header passed over")
     units = _units_above(lines[: header.at + 1], header, given)
     end, units, scales, said = _read_below(lines, header, columns, units, given)
     body, remarks = lines[end:], remarks + said
@@ -132,9 +130,11 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
         plain = [cell.replace(decimal, ".") for cell in read]
         values = np.array([float(cell) for cell in plain if POINT.match(cell)])
         units[name] = in_steps(values, [scale], units.get(name, ""))
-    start = lines[end - 1].end if end else lines[0].start
+    number, start = lines[-1].number + 1, lines[-1].end
+    if body:
+        number, start = body[0].number, body[0].start
     title = "" if given or header.at < 0 else lines[header.at].text
-    return TableLayout(delimiter, decimal, tuple(names), end + 1, start, (*remarks,), units, title)
+    return TableLayout(delimiter, decimal, tuple(names), number, start, (*remarks,), units, title)
 
 
 def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
@@ -145,8 +145,8 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
     Returns:
         Their names, and whether it is dates and times.
     """
-    lines = split_lines(head)[layout.first_line - 1 : layout.first_line + TRIED]
-    rows = [layout.cells(line.text) for line in lines if line.text.strip()]
+    lines = [line for line in split_lines(head) if line.number >= layout.first_line]
+    rows = [layout.cells(line.text) for line in lines[:TRIED]]
     found = {}
     for name, column in zip(layout.header, zip_longest(*rows, fillvalue=""), strict=False):
         numbers = sum(is_number(cell, layout.decimal) for cell in column)
@@ -159,11 +159,12 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
 
 def share_of_rows(head: bytes) -> float:
     """Share of the first lines that are rows of numbers, of more than one; prose has hardly any."""
-    lines = [line.text for line in split_lines(head) if line.text.strip()][:SEARCHED]
+    lines = [line.text for line in split_lines(head)[:SEARCHED]]
 
     def is_row(row: list[str], mark: str) -> bool:
-        numbers = sum(is_reading(cell, ",") for cell in row)
-        return numbers >= max(min(2, len(row)), (0.5 if mark == " " else 0.25) * len(row), 1)
+        return count_readings(row) >= max(
+            min(2, len(row)), (0.5 if mark == " " else 0.25) * len(row), 1
+        )
 
     rows = max(sum(is_row(cells(text, mark), mark) for text in lines) for mark in DELIMITERS)
     return rows / len(lines) if rows > 1 else 0.0
@@ -171,7 +172,7 @@ def share_of_rows(head: bytes) -> float:
 
 def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:
     """The header with a nameless column: lines end with a delimiter, or begin with their number."""
-    rows = [cells(line.text, delimiter) for line in body[:TRIED] if line.text.strip()]
+    rows = [cells(line.text, delimiter) for line in body[:TRIED]]
     longer = [row for row in rows if len(row) == len(header) + 1]
     if not rows or len(longer) < len(rows):
         return header
@@ -197,8 +198,8 @@ def _decimal(body: list[Line], header: list[str], columns: Sequence[str], delimi
                 where=f"row {number}, column '{column}'",
                 remedy="export without thousands separators",
             )
-    commas = [each for each in read if COMMA.match(each[0])]
-    points = [each for each in read if POINT.match(each[0]) and "." in each[0]]
+    commas = [each for each in read if "," in each[0] and is_number(each[0], ",")]
+    points = [each for each in read if "." in each[0] and is_number(each[0], ".")]
     if not commas or (delimiter == "," and points):
         return "."
     (comma, row, _), *_ = commas
@@ -248,7 +249,7 @@ def _read_below(
             and (not remark or are_units(row))
             and (not is_property or all(unit(x) for x in row if x and not x[0].isdigit()))
         )
-        if line.text.strip() and not (remark or is_property or has_units):
+        if not (remark or is_property or has_units):
             break
         end += 1
         if has_units:

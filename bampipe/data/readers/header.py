@@ -3,7 +3,7 @@
 import csv
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from typing import NamedTuple
@@ -21,7 +21,7 @@ NULLS = ("", "nan", "NaN", "NAN", "NA", "N/A", "n/a", "#N/A", "null", "NULL", "N
 """Cells that mean: no number here."""
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
 POINT = re.compile(rf"{NUMBER}\Z")
-COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
+_COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
 _REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?")
 _BYTE_ORDER = b"\xef\xbb\xbf"
 _NUMBERED = "column_"
@@ -45,7 +45,7 @@ class Line:
 
 
 def split_lines(head: bytes) -> list[Line]:
-    """The whole lines of ``head``, and the last one where it is all there is.
+    """The whole lines of ``head`` that are not blank, and the last one where it is all there is.
 
     Raises:
         InputError: the first text is not UTF-8.
@@ -59,20 +59,16 @@ def split_lines(head: bytes) -> list[Line]:
         try:
             text = match[0].decode("utf-8")
         except UnicodeDecodeError as error:
-            if number <= 2 and not any(line.text.strip() for line in found):
+            if number <= 2 and not found:
                 raise InputError(
                     "the header is not UTF-8 text",
                     where=f"row {number}",
                     remedy='save it as UTF-8, or say encoding = "latin-1" under [csv]',
                 ) from error
             text = match[0].decode("utf-8", "replace")
-        found.append(Line(number, start + match.start(), end, text.rstrip("\r\n")))
+        if text.strip():
+            found.append(Line(number, start + match.start(), end, text.rstrip("\r\n")))
     return found
-
-
-def filled(lines: list[Line]) -> list[int]:
-    """Places of the lines that are not blank."""
-    return [n for n, line in enumerate(lines) if line.text.strip()]
 
 
 def cells(text: str, delimiter: str) -> list[str]:
@@ -95,17 +91,12 @@ def without_mark(text: str) -> str:
 
 def is_number(cell: str, decimal: str) -> bool:
     """Whether a cell is a number with a point or, where that is the sign, a decimal comma."""
-    return bool(POINT.match(cell) or (decimal == "," and COMMA.match(cell)))
+    return bool(POINT.match(cell) or (decimal == "," and _COMMA.match(cell)))
 
 
-def is_reading(cell: str, decimal: str) -> bool:
-    """Whether a cell is a number or a date and time."""
-    return is_number(cell, decimal) or is_moment(cell)
-
-
-def is_word(cell: str) -> bool:
-    """Whether a cell begins with a word."""
-    return re.match(r"[^\W\d_]{2}", cell) is not None
+def count_readings(row: Iterable[str]) -> int:
+    """Number of cells that are numbers, with whatever decimal sign, or dates and times."""
+    return sum(is_number(cell, ",") or is_moment(cell) for cell in row)
 
 
 def are_units(row: list[str]) -> bool:
@@ -147,10 +138,9 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
     delimiters: list[str] = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
     starts = find_starts(lines, delimiters)
     first, mark = starts[0]
-    last_above = max(filled(lines[:first]), default=-1)
     if dialect.names:
         check_columns(dialect.names, columns, "csv.names")
-        return Header(last_above, mark, list(dialect.names))
+        return Header(first - 1, mark, list(dialect.names))
     samples = cells(lines[first].text, mark) if first < len(lines) else []
     width = len(samples)
 
@@ -175,11 +165,11 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
     unnamed = sum(bool(re.search(r"\w", name)) for name in row) < width
     if unnamed and len(listed) == width > 1 and {*columns} <= {*listed}:
         check_columns(listed, columns, "the list of columns")
-        return Header(last_above, mark, listed)
+        return Header(first - 1, mark, listed)
     if index < 0:
         row = [f"{_NUMBERED}{n}" for n, _ in enumerate(samples, 1)]
         if set(columns) <= set(row):
-            return Header(last_above, mark, row)
+            return Header(first - 1, mark, row)
         raise InputError(
             "no header: the first line holds numbers",
             where=f"row {lines[0].number}",
@@ -193,18 +183,17 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
 def find_starts(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
     """Candidate starts of the samples and delimiters of their columns that are equally good."""
     ranked: list[tuple[float, int, str]] = []
-    tried = [line for line in lines[-TRIED:] if line.text.strip()]
     for delimiter in delimiters:
-        rows = [cells(line.text, delimiter) for line in tried]
+        rows = [cells(line.text, delimiter) for line in lines[-TRIED:]]
         width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
-        count = sum(_count_readings(row, delimiter) for row in rows if len(row) == width)
+        count = sum(count_readings(row) for row in rows if len(row) == width)
         share = count / (width * len(rows)) if width else 0.0
         ranked.append((share * width if width > 1 else 0.0, width, delimiter))
     found = []
     best = max(score for score, _, _ in ranked)
     for _, width, delimiter in (each for each in ranked if each[0] >= _ALIKE * best):
         split = [cells(line.text, delimiter) for line in lines]
-        numbers = [_count_readings(row, delimiter) if len(row) == width else 0 for row in split]
+        numbers = [count_readings(row) if len(row) == width else 0 for row in split]
         worded = [re.match(r"[^\W\d_]", row[0]) is not None if row else False for row in split]
         if 2 * sum(worded) < len(split):  # where samples begin with a number
             numbers = [0 if word else n for n, word in zip(numbers, worded, strict=True)]
@@ -223,23 +212,17 @@ def find_starts(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str
     return found
 
 
-def _count_readings(row: list[str], delimiter: str) -> int:
-    """Number of cells that are numbers or moments; a comma inside one is a decimal sign."""
-    decimal = "." if delimiter == "," else ","
-    return sum(is_reading(cell, decimal) for cell in row)
-
-
 def _is_sparse(row: list[str], width: int) -> bool:
     """Whether a line is a sample in which cells are empty: numbers and moments, nothing else."""
-    return len(row) == width > 1 and all(cell in NULLS or is_reading(cell, ",") for cell in row)
+    return len(row) == width > 1 and all(cell in NULLS or count_readings([cell]) for cell in row)
 
 
 def _find_above(lines: list[Line], first: int, delimiter: str) -> int:
     """Place of the header above the first sample, -1 where there is none."""
     if first >= len(lines):
-        return next(iter(filled(lines)), -1)
-    sample, above = cells(lines[first].text, delimiter), filled(lines[:first])
-    width, near = len(sample), above[-4:]
+        return 0
+    sample, near = cells(lines[first].text, delimiter), range(max(first - 4, 0), first)
+    width = len(sample)
     bare = {n: cells(without_mark(lines[n].text), delimiter) for n in near}
     rows = {n: _trimmed(row, width) for n, row in bare.items()}
     for n in near[-2:]:
@@ -259,7 +242,7 @@ def _find_above(lines: list[Line], first: int, delimiter: str) -> int:
         fitting.pop()  # Type: double
     while len(fitting) > 1 and all(rows[fitting[-2]]) and _says_more(rows[fitting[-1]]):
         fitting.pop()
-    for n in reversed(above):
+    for n in reversed(range(first)):
         row = cells(lines[n].text, delimiter)
         begun = not sample[0] and re.search(r"(?i)names?:?\Z", row[0])
         if len(row) == width and (begun or _is_key_of_names(row)):
@@ -309,7 +292,7 @@ def _counted(name: str) -> list[str]:
 def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> list[str]:
     """Names in a header, which may be written as a remark: ``# t x`` has two names or three."""
     plain, bare = (cells(t, delimiter) for t in (text, without_mark(text)))
-    written = (line.text for line in below if line.text.strip() and not is_remark(line.text))
+    written = (line.text for line in below if not is_remark(line.text))
     rows = list(islice(written, SEARCHED))
     if len(plain) == len(bare):
         row = bare if is_remark(text) and plain[0].strip("#%/") else plain
