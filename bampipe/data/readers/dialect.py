@@ -12,25 +12,8 @@ from itertools import zip_longest
 
 import numpy as np
 
-from bampipe.data.readers.header import (
-    DELIMITERS,
-    NULLS,
-    POINT,
-    SEARCHED,
-    TRIED,
-    Header,
-    Line,
-    are_units,
-    cells,
-    count_readings,
-    find_header,
-    find_starts,
-    is_number,
-    is_remark,
-    of_properties,
-    split_lines,
-    without_mark,
-)
+from bampipe.data.readers import heads
+from bampipe.data.readers.heads import DELIMITERS, NULLS, Header, Line, cells
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect
 from bampipe.data.units import bare, in_steps, unit, units_in
@@ -81,7 +64,7 @@ class TableLayout:
 
     def is_remark(self, text: str) -> bool:
         """Whether a line begins with a word, where samples begin with a number or a time."""
-        return is_remark(text) or _WORD.match(next(iter(self.cells(text)), "")) is not None
+        return heads.is_remark(text) or _WORD.match(next(iter(self.cells(text)), "")) is not None
 
     def ends_in_words(self, text: str) -> bool:
         """Whether words, such as what an operator noted, stand behind the last cell of a line."""
@@ -91,12 +74,12 @@ class TableLayout:
     def is_chatter(self, text: str) -> bool:
         """Whether a line among the samples is text without a number in any cell, or ends in it."""
         row = [cell for cell in self.cells(text) if cell not in NULLS]
-        count = count_readings(row)
+        count = heads.count_readings(row)
         # The title of a block may hold its number.
         titled = len(self.cells(text)) != len(self.header) and self.is_remark(text)
         plain = 2 * count < len(row) if titled else not count
         wordy = plain and text.expandtabs().isprintable() and any(map(str.isalpha, text))
-        return wordy or is_remark(text) or self.ends_in_words(text)
+        return wordy or heads.is_remark(text) or self.ends_in_words(text)
 
 
 def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableLayout:
@@ -107,10 +90,10 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     Raises:
         InputError: no header, a column missing, or a layout that can be read in two ways.
     """
-    lines = split_lines(head)
+    lines = heads.split_lines(head)
     if not lines:
         raise InputError("the file holds no text")
-    header = find_header(lines, columns, dialect)
+    header = heads.find_header(lines, columns, dialect)
     delimiter, given = header.delimiter, bool(dialect.names)
     remarks = []
     if delimiter != "," and not dialect.delimiter:
@@ -118,17 +101,17 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     if header.at > 0:
         remarks.append(f"{header.at} lines above the header passed over")
     units = _units_above(lines[: header.at + 1], header, given)
-    end, units, scales, said = _read_below(lines, header, columns, units, given)
+    end, units, scales, said = _read_below(lines, header, columns, units)
     body, remarks = lines[end:], remarks + said
     names = _padded(header.names, body, delimiter)
     decimal = dialect.decimal or _decimal(body, names, columns, delimiter)
     if decimal == "," and not dialect.decimal:
         remarks.append("decimal commas")
     for name, scale in scales.items():
-        rows = (cells(line.text, delimiter) for line in body[:TRIED])
+        rows = (cells(line.text, delimiter) for line in body[: heads.TRIED])
         read = [row[names.index(name)] for row in rows if len(row) == len(names)]
         plain = [cell.replace(decimal, ".") for cell in read]
-        values = np.array([float(cell) for cell in plain if POINT.match(cell)])
+        values = np.array([float(cell) for cell in plain if heads.POINT.match(cell)])
         units[name] = in_steps(values, [scale], units.get(name, ""))
     number, start = lines[-1].number + 1, lines[-1].end
     if body:
@@ -145,11 +128,11 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
     Returns:
         Their names, and whether it is dates and times.
     """
-    lines = [line for line in split_lines(head) if line.number >= layout.first_line]
-    rows = [layout.cells(line.text) for line in lines[:TRIED]]
+    lines = [line for line in heads.split_lines(head) if line.number >= layout.first_line]
+    rows = [layout.cells(line.text) for line in lines[: heads.TRIED]]
     found = {}
     for name, column in zip(layout.header, zip_longest(*rows, fillvalue=""), strict=False):
-        numbers = sum(is_number(cell, layout.decimal) for cell in column)
+        numbers = sum(heads.is_number(cell, layout.decimal) for cell in column)
         moments, held = sum(map(is_moment, column)), sum(cell not in NULLS for cell in column)
         enough = max(numbers, moments) > max(0.5 * held, _LEAST_FILLED * len(rows))
         if name and enough and layout.header.count(name) == 1:
@@ -159,10 +142,10 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
 
 def share_of_rows(head: bytes) -> float:
     """Share of the first lines that are rows of numbers, of more than one; prose has hardly any."""
-    lines = [line.text for line in split_lines(head)[:SEARCHED]]
+    lines = [line.text for line in heads.split_lines(head)[: heads.SEARCHED]]
 
     def is_row(row: list[str], mark: str) -> bool:
-        return count_readings(row) >= max(
+        return heads.count_readings(row) >= max(
             min(2, len(row)), (0.5 if mark == " " else 0.25) * len(row), 1
         )
 
@@ -172,7 +155,7 @@ def share_of_rows(head: bytes) -> float:
 
 def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:
     """The header with a nameless column: lines end with a delimiter, or begin with their number."""
-    rows = [cells(line.text, delimiter) for line in body[:TRIED]]
+    rows = [cells(line.text, delimiter) for line in body[: heads.TRIED]]
     longer = [row for row in rows if len(row) == len(header) + 1]
     if not rows or len(longer) < len(rows):
         return header
@@ -187,7 +170,7 @@ def _decimal(body: list[Line], header: list[str], columns: Sequence[str], delimi
     """Decimal sign of the first lines; InputError where there are both, or digits in thousands."""
     read = [
         (cell, line.number, column)
-        for line in body[:TRIED]
+        for line in body[: heads.TRIED]
         for column, cell in zip(header, cells(line.text, delimiter), strict=False)
         if not columns or column in columns
     ]
@@ -198,8 +181,8 @@ def _decimal(body: list[Line], header: list[str], columns: Sequence[str], delimi
                 where=f"row {number}, column '{column}'",
                 remedy="export without thousands separators",
             )
-    commas = [each for each in read if "," in each[0] and is_number(each[0], ",")]
-    points = [each for each in read if "." in each[0] and is_number(each[0], ".")]
+    commas = [each for each in read if "," in each[0] and heads.is_number(each[0], ",")]
+    points = [each for each in read if "." in each[0] and heads.is_number(each[0], ".")]
     if not commas or (delimiter == "," and points):
         return "."
     (comma, row, _), *_ = commas
@@ -219,34 +202,31 @@ def _decimal(body: list[Line], header: list[str], columns: Sequence[str], delimi
 
 
 def _read_below(
-    lines: list[Line], header: Header, columns: Sequence[str], units: dict[str, str], given: bool
+    lines: list[Line], header: Header, columns: Sequence[str], units: dict[str, str]
 ) -> tuple[int, dict[str, str], dict[str, float], list[str]]:
-    """Read what stands between the names and the samples.
-
-    ``units``: by column, of what is above; ``given``: whether the session names the columns.
+    """Read what stands between the names and the samples, beside the ``units`` of what is above.
 
     Returns:
         The number of lines above the samples, units and scales by column, and remarks.
     """
     body, names, end = lines[header.at + 1 :], header.names, header.at + 1
     title = lines[max(header.at, 0)].text
-    first = find_starts(body, [header.delimiter])[0][0]
+    first = heads.find_starts(body, [header.delimiter])[0][0]
     scales, remarks = dict[str, float](), list[str]()
     for at, line in enumerate(body):
-        remark = is_remark(line.text)
-        row = cells(without_mark(line.text) if remark else line.text, header.delimiter)
-        if header.delimiter == " " and 1 < len(row) < len(names) and are_units(row):
+        remark = heads.is_remark(line.text)
+        row = cells(heads.without_mark(line.text) if remark else line.text, header.delimiter)
+        if header.delimiter == " " and 1 < len(row) < len(names) and heads.are_units(row):
             row = _under_names(line.text, names, title)
         key = row[0] if row else ""
-        row, is_property = of_properties(row)
+        row, is_property = heads.of_properties(row)
         is_property &= at < first < len(body)
         if _SCALES.fullmatch(key) and key not in row:
             is_property = True
-            scales = {h: float(x) for h, x in zip(names, row, strict=False) if POINT.match(x)}
+            scales = {h: float(x) for h, x in zip(names, row, strict=False) if heads.POINT.match(x)}
         has_units = (
-            not given
-            and _is_unit_row(row, names, columns)
-            and (not remark or are_units(row))
+            _is_unit_row(row, names, columns)
+            and (not remark or heads.are_units(row))
             and (not is_property or all(unit(x) for x in row if x and not x[0].isdigit()))
         )
         if not (remark or is_property or has_units):
@@ -285,7 +265,7 @@ def _is_unit_row(row: list[str], header: list[str], columns: Sequence[str]) -> b
         and 2 * len(said) >= len(wanted)
         and bool(said)
         and all(_UNIT.match(cell) and cell not in NULLS for cell in said)
-        and not any(POINT.match(cell) and cell != "1" for cell in said)
+        and not any(heads.POINT.match(cell) and cell != "1" for cell in said)
         and any(re.search(r"[A-Za-z%°Ωµμ]", cell) and len(bare(cell)) <= 10 for cell in said)
     )
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import count, pairwise
 from typing import Any
 
-from bampipe.data.readers.header import cells
+from bampipe.data.readers.heads import cells
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER
 from bampipe.data.units import unit
@@ -118,9 +118,9 @@ def find_form(head: str) -> Form | None:
     if found := _of_program(head, whole):
         return found
     ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
-    if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
-        return Form("", lambda line: line.removesuffix(";"))
-    if re.fullmatch(r"[^\[]*\]\s*;?\s*", lines[-1]):  # of a matrix of MATLAB
+    apart = all(re.search(r"[,\t |]", line) for line in ended)
+    of_matrix = re.fullmatch(r"[^\[]*\]\s*;?\s*", lines[-1])  # of MATLAB
+    if of_matrix or (2 * len(ended) > len(lines) and apart):
         return Form("", lambda line: re.sub(r"^\s*\[|[\s;]*\]?[\s;]*$", "", line))
     if _are(_STAMPED, lines):
         return _stamped(lines)

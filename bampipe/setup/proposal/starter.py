@@ -14,6 +14,7 @@ from bampipe.data.units import unit as unit_named
 from bampipe.data.vocabulary import word_set
 from bampipe.physics.device import KINDS
 from bampipe.physics.expression import FUNCTIONS
+from bampipe.results.rounding import rounded
 from bampipe.setup.hypotheses import MOST_TRAVEL
 from bampipe.setup.proposal.positions import SLIDING, TURNING, in_counts
 from bampipe.setup.sentences import sentence
@@ -150,14 +151,14 @@ def starter_device(
         scaled=listed and sentence("scaled", constants=listed), viscous=viscous, coulomb=coulomb,
     )  # fmt: skip
     least, spread = _least_inertia(linear, drive.coil, found), 0.6 * wide * abs(found.coulomb)
-    inertia = (*_prior(found.inertia, wide), f"lower = {least:g}")
-    offset = ("prior = 0.0", f"sd = {_rounded(spread or 20.0):g}")
+    inertia = (*_prior(found.inertia, wide), f"lower = {rounded(least)}")
+    offset = ("prior = 0.0", f"sd = {rounded(spread or 20.0)}")
     text += _parameter(f"inertia{end}", mass, inertia, "all that moves, reduced to this axis")
     text += _parameter(f"offset{end}", torque, offset, sentence("offset"))
     if weight is not None:
         meaning = "mass times gravity times distance of the centre of gravity"
         for name, size in zip(("moment", "moment_across"), weight.moments, strict=True):
-            guessed = (f"prior = {_rounded(size):g}", f"sd = {_rounded(0.2 * wide * weight.sd):g}")
+            guessed = (f"prior = {rounded(size)}", f"sd = {rounded(0.2 * wide * weight.sd)}")
             text += _parameter(name, "N.m", guessed, meaning)
     if drive.coil:
         for name, si, size in (
@@ -227,7 +228,7 @@ def _least_inertia(linear: bool, coil: bool, found: Driven) -> float:
     least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if linear else 1e-5
     least = min(least, _FASTEST_S * found.viscous) if found.viscous > 0.0 else least
     heavy = 0.3 * min(found.inertia, 1.0) if found.inertia > 0.0 else 0.3
-    return _rounded(max(least, heavy) if coil and linear else least)
+    return max(least, heavy) if coil and linear else least
 
 
 def _parameter(name: str, unit: str, guessed: tuple[str, ...], meaning: str, more: str = "") -> str:
@@ -240,8 +241,4 @@ def _prior(size: float, wide: float) -> tuple[str, str]:
     """A prior of the size found and its spread, ``wide`` times that; 100 of 1 of nothing found."""
     if size <= 0.0:
         return "prior = 1.0", "sd = 100.0"
-    return f"prior = {_rounded(size):g}", f"sd = {_rounded(wide * size):g}"
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.2g}")
+    return f"prior = {rounded(size)}", f"sd = {rounded(wide * size)}"

@@ -146,8 +146,7 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
 
     def names(index: int, delimiter: str) -> list[str]:
         row = _names(lines[index].text, delimiter, lines[index + 1 :], lines[:index])
-        row = _trimmed(row, width)
-        return row if width - 1 <= len(row) <= width else _otherwise(lines[index].text, width, row)
+        return _fitted(row, lines[index].text, width)
 
     for index, line in enumerate(lines[:SEARCHED]) if columns else ():
         for delimiter in delimiters:
@@ -187,8 +186,7 @@ def find_starts(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str
         rows = [cells(line.text, delimiter) for line in lines[-TRIED:]]
         width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
         count = sum(count_readings(row) for row in rows if len(row) == width)
-        share = count / (width * len(rows)) if width else 0.0
-        ranked.append((share * width if width > 1 else 0.0, width, delimiter))
+        ranked.append((count / len(rows) if width > 1 else 0.0, width, delimiter))
     found = []
     best = max(score for score, _, _ in ranked)
     for _, width, delimiter in (each for each in ranked if each[0] >= _ALIKE * best):
@@ -224,10 +222,7 @@ def _find_above(lines: list[Line], first: int, delimiter: str) -> int:
     sample, near = cells(lines[first].text, delimiter), range(max(first - 4, 0), first)
     width = len(sample)
     bare = {n: cells(without_mark(lines[n].text), delimiter) for n in near}
-    rows = {n: _trimmed(row, width) for n, row in bare.items()}
-    for n in near[-2:]:
-        if not width - 1 <= len(rows[n]) <= width:
-            rows[n] = _otherwise(lines[n].text, width, rows[n])
+    rows = {n: _fitted(row, lines[n].text, width) for n, row in bare.items()}
     # Below the names stands nothing with fewer cells: that is what a logger says as it starts.
     apart = [n for n, row in rows.items() if len(row) < width - 1 and not is_remark(lines[n].text)]
     fitting = [
@@ -269,13 +264,14 @@ def _listed(above: list[Line]) -> list[str]:
     return [match[2].strip() for match in found] if in_order else []
 
 
-def _trimmed(row: list[str], width: int) -> list[str]:
-    """A header without what is behind a last delimiter that the ``width`` cells below lack."""
-    return row[:-1] if len(row) == width + 1 and not row[-1] else row
+def _fitted(row: list[str], text: str, width: int) -> list[str]:
+    """The names in a header over ``width`` cells, where it is separated otherwise than those, too.
 
-
-def _otherwise(text: str, width: int, row: list[str]) -> list[str]:
-    """The names in a header that is separated otherwise than the samples, else its ``row``."""
+    Without what is behind a last delimiter that they lack; its ``row`` where nothing fits.
+    """
+    row = row[:-1] if len(row) == width + 1 and not row[-1] else row
+    if width - 1 <= len(row) <= width:
+        return row
     plain = without_mark(text).strip()
     split = [cells(plain, delimiter) for delimiter in DELIMITERS]
     split += [re.split(r"\s{2,}", plain), re.split(r"\s+(?![\[(])", plain)]
