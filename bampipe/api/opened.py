@@ -194,7 +194,4 @@ def open_run(path: str | Path) -> Run:
     Raises:
         InputError: there is no such run.
     """
-    known = (
-        place for place in (Path(path), Path("runs") / path) if (place / record.FILE).is_file()
-    )
-    return Run(next(known, path))
+    return Run(record.find_folder(path, Path("runs")) or path)

@@ -210,14 +210,13 @@ def _read_below(
         The number of lines above the samples, units and scales by column, and remarks.
     """
     body, names, end = lines[header.at + 1 :], header.names, header.at + 1
-    title = lines[max(header.at, 0)].text
     first = heads.find_starts(body, [header.delimiter])[0][0]
     scales, remarks = dict[str, float](), list[str]()
     for at, line in enumerate(body):
         remark = heads.is_remark(line.text)
         row = cells(heads.without_mark(line.text) if remark else line.text, header.delimiter)
         if header.delimiter == " " and 1 < len(row) < len(names) and heads.are_units(row):
-            row = _under_names(line.text, names, title)
+            row = _under_names(line.text, names, lines[header.at].text)
         key = row[0] if row else ""
         row, is_property = heads.of_properties(row)
         is_property &= at < first < len(body)

@@ -237,13 +237,12 @@ class _Samples:
     def passes_over(self, message: str, line: Line, layout: TableLayout) -> bool:
         """Whether a word stands where a number is expected: no reading, as "OVERLOAD" says."""
         cell = _CELL.search(message)
-        word = cell[3] if cell else ""
-        if not _NO_READING.fullmatch(word) or len(self.nothing) == _MOST_WORDS:
+        if not cell or not _NO_READING.fullmatch(cell[3]) or len(self.nothing) == _MOST_WORDS:
             return False
-        self.nothing.append(word)
-        column = layout.header[int(cell[1])] if cell else ""
+        self.nothing.append(cell[3])
+        column = layout.header[int(cell[1])]
         self.notes.append(
-            f"column '{column}' says '{word}' from row {line.number} on: taken as no reading"
+            f"column '{column}' says '{cell[3]}' from row {line.number} on: taken as no reading"
         )
         return True
 
