@@ -24,6 +24,8 @@ POINT = re.compile(rf"{NUMBER}\Z")
 _COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
 _REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?")
 _BYTE_ORDER = b"\xef\xbb\xbf"
+_PROPERTY = re.compile(r"\A[A-Za-z ]+:\s+(?=\S)")
+"""Key before what a cell says of a channel: ``Type: double``."""
 _NUMBERED = "column_"
 _NAME_KEYS = word_set("name_keys")
 _LISTED = re.compile(
@@ -110,9 +112,8 @@ def of_properties(row: list[str]) -> tuple[list[str], bool]:
     Programs for measurements write what they know of a channel there.
     """
     said = [cell for cell in row if cell]
-    keys = [match for cell in said if (match := re.match(r"([A-Za-z ]+):\s+\S", cell))]
-    if len(keys) >= 0.5 * len(said) > 0:
-        return [re.sub(r"^[A-Za-z ]+:\s+", "", cell) for cell in row], True
+    if len([*filter(_PROPERTY.match, said)]) >= 0.5 * len(said) > 0:
+        return [_PROPERTY.sub("", cell) for cell in row], True
     key = row[0] if row else ""
     listed = re.match(r"[^\W\d_]{3}", key) is not None and key.lower() not in ("sec", "rad", "deg")
     alone = row.count(key) > 1 or unit(key) is None
@@ -233,8 +234,8 @@ def _find_above(lines: list[Line], first: int, delimiter: str) -> int:
         and not all(map(POINT.match, row))
         and all(any(map(str.isalnum, cell)) for cell in row if cell)
     ]
-    while len(fitting) > 1 and any(re.match(r"[A-Za-z ]+:\s+\S", c) for c in rows[fitting[-1]]):
-        fitting.pop()  # Type: double
+    while len(fitting) > 1 and any(map(_PROPERTY.match, rows[fitting[-1]])):
+        fitting.pop()
     while len(fitting) > 1 and all(rows[fitting[-2]]) and _says_more(rows[fitting[-1]]):
         fitting.pop()
     for n in reversed(range(first)):

@@ -138,12 +138,11 @@ def find_form(head: str) -> Form | None:
         table = [cells(line, delimiter) for line in (*whole[:_TRIED], *lines)]
         width = Counter(map(len, table)).most_common(1)[0][0]
         rows = [row for row in table if len(row) == width > 1]
-        found = None
-        if len(rows) > _MOST * len(table):
-            every = [row for row in (cells(x, delimiter) for x in whole) if len(row) == width]
-            found = _grouped(every, delimiter)
-            found = found or (_cells(rows[0], rows[1:], delimiter) if delimiter != " " else None)
-        if found:
+        if len(rows) <= _MOST * len(table):
+            continue
+        every = [row for row in (cells(x, delimiter) for x in whole) if len(row) == width]
+        of_cells = _cells(rows[0], rows[1:], delimiter) if delimiter != " " else None
+        if found := _grouped(every, delimiter) or of_cells:
             return found
     for line in (*whole[:_FEWEST], lines[-1]):
         for kind in VOCABULARY["no_tables"]:
