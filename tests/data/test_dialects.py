@@ -90,6 +90,7 @@ def test_units_of_names_and_of_the_line_below_are_taken_and_what_was_found_is_sa
     trial = read(tmp_path, WRITTEN["unit row in brackets"])
     assert trial.units == {"t": "s", "x": "mm", "n": "-"}
     assert trial.first_row == 3 and "row 2 gives units" in trial.remarks
+    assert read(tmp_path, "t,x,n\ns,mm,-\n\n0,1,2\n1,2,3\n").first_row == 4
     trial = read(tmp_path, PREAMBLE + table(";", ","))
     assert trial.remarks == (
         "columns are separated by semicolons",
