@@ -12,6 +12,7 @@ from conftest import Command
 from made_results import write_model, write_result
 
 from bampipe.api.opened import Run
+from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.lab.rows import read_run
@@ -22,7 +23,7 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.run import GateVerdict
 from bampipe.results.validate import ValidateResult
-from bampipe.run import accepted, gates, models, pipeline
+from bampipe.run import accepted, gates, pipeline
 from bampipe.run.request import Outcome, Request
 from bampipe.run.state import RunState
 from bampipe.run.summaries import markdown
@@ -143,11 +144,11 @@ def test_every_command_takes_the_best_confirmed_model(
         axis = {"held_out_rmse": error, "noise_floor": 0.1}
         axis["standing"] = compare_with_floor(error, 0.1)
         write_result(root, ValidateResult, model=name, axes={"yaw": axis})
-    assert models.default_model(root) == "base", "nothing has been compared"
+    assert RunFolder(root).default_model() == "base", "nothing has been compared"
     code, out, _ = command("accept", "s1")
     assert code == 0 and "warning: yaw: the error is above the noise floor, 5.6 times" in out
     write_result(root, CompareResult, best=better, ladder=[{"model": "base"}, {"model": better}])
-    assert models.default_model(root) == Run(root).model == Results(root).model == better
+    assert RunFolder(root).default_model() == Run(root).model == Results(root).model == better
     code, out, _ = command("accept", "s1")
     assert code == 0 and f"model {better}" in out and "warning" not in out
     kept = json.loads((tmp_path / "accepted/bam.json").read_text())

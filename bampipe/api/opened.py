@@ -17,7 +17,7 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.record import Record, Result
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
-from bampipe.run import models, record
+from bampipe.run import record
 
 R = TypeVar("R", bound=Result)
 T = TypeVar("T")
@@ -96,7 +96,7 @@ class Run:
     @property
     def model(self) -> str:
         """The best confirmed model."""
-        return models.default_model(self.root)
+        return self._results.model
 
     def effects(self, model: str = "") -> tuple[str, ...]:
         """The effects of a model."""
@@ -194,7 +194,4 @@ def open_run(path: str | Path) -> Run:
     Raises:
         InputError: there is no such run.
     """
-    known = (
-        place for place in (Path(path), Path("runs") / path) if (place / record.FILE).is_file()
-    )
-    return Run(next(known, path))
+    return Run(record.find_folder(path, Path("runs")) or path)

@@ -1,5 +1,6 @@
 """``bampipe diagnose``, ``draft``, ``extend`` and ``demo``: the loop as commands."""
 
+from dataclasses import replace
 from typing import Annotated
 
 import typer
@@ -18,7 +19,7 @@ from bampipe.cli.options import (
     RunsOption,
     StageOptions,
 )
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import BASE, RunFolder
 from bampipe.errors import InputError
 
 
@@ -103,7 +104,7 @@ def extend(
     from bampipe.cli.next_step import after_loop
     from bampipe.results.compare import CompareResult
     from bampipe.results.identify import IdentifyResult
-    from bampipe.run import batch, models
+    from bampipe.run import batch, models, record
     from bampipe.run import pipeline as pipelines
     from bampipe.run.request import Request
 
@@ -113,7 +114,7 @@ def extend(
         raise InputError("--draft goes with --auto", remedy="or use `bampipe draft RUN`")
     if auto and effects:
         raise InputError("--auto chooses the effects itself", remedy=f"leave out {effects[0]!r}")
-    names_run = first is None or auto or bool(places.run_folder_of(first, runs))
+    names_run = first is None or auto or bool(record.find_folder(first, runs))
     if first is not None and not names_run and (not effects or _is_effect(first)):
         effects, first = [first, *effects], None
     if not auto and not effects:
@@ -153,8 +154,6 @@ def demo(runs: RunsOption = RUNS, force: ForceOption = False, quiet: QuietOption
 
     Example: bampipe demo
     """
-    from dataclasses import replace
-
     from bampipe.api.loop import LoopOptions, follow
     from bampipe.results.compare import CompareResult
     from bampipe.results.truth import TruthResult
@@ -176,7 +175,7 @@ def demo(runs: RunsOption = RUNS, force: ForceOption = False, quiet: QuietOption
     with show.Watcher(quiet) as watcher:
         show.say(f"1. {session}: an arm with a fault that its model lacks.")
         run_session(replace(request, session=session, judge=True), watcher)
-        for axis, error in run.read(ValidateResult, models.BASE).axes.items():
+        for axis, error in run.read(ValidateResult, BASE).axes.items():
             show.say(
                 f"   {axis}: error on unseen trials {error.held_out_rmse:.3g} {error.unit}, "
                 f"sensor noise alone would leave {error.noise_floor:.3g} {error.unit}"
@@ -185,7 +184,7 @@ def demo(runs: RunsOption = RUNS, force: ForceOption = False, quiet: QuietOption
             "2. Which effect is missing? Diagnose and extend the model until nothing is missing."
         )
         options = LoopOptions(replace(request, pipeline=complete), watcher)
-        last = follow(options, models.BASE, lambda line: show.say(f"   {line}"))
+        last = follow(options, BASE, lambda line: show.say(f"   {line}"))
         show.say("3. The error on unseen trials, model by model.")
         for rung in run.read(CompareResult).ladder:
             errors = ", ".join(

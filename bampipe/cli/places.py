@@ -10,15 +10,6 @@ from bampipe.run.session_name import session_folder, session_id
 _FIRST = "start with `bampipe run SESSION`"
 
 
-def run_folder_of(argument: str, runs: Path) -> Path | None:
-    """Return the run folder: a bare name is first of all one in ``runs``, anything else a path."""
-    from bampipe.run import record
-
-    is_name = argument == Path(argument).name
-    places = (runs / argument, Path(argument)) if is_name else (Path(argument), runs / argument)
-    return next((path for path in places if (path / record.FILE).is_file()), None)
-
-
 def find_run(argument: str | None, runs: Path) -> Path:
     """Return the run folder that ``argument`` means.
 
@@ -39,7 +30,7 @@ def find_run(argument: str | None, runs: Path) -> Path:
         if not known:
             raise InputError(f"no run yet in {runs}", remedy=_FIRST)
         return known[0]
-    if root := run_folder_of(argument, runs):
+    if root := record.find_folder(argument, runs):
         return root
     folder = session_folder(argument)
     if not (folder / "session.toml").is_file():

@@ -17,6 +17,7 @@ from bampipe.cli.options import (
     SessionArgument,
     StageOptions,
 )
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.run.session_name import session_id
@@ -139,13 +140,12 @@ def next_(
     Example: bampipe next robot_arm --as trajectory --out motion.yaml
     """
     from bampipe.cli.next_step import after_proposal, print_forecasts
-    from bampipe.run import models
 
     suffix = _choose_trajectory(form, out, plan)
     if sd and not plan:
         raise InputError("--sd needs --plan", remedy="give --plan with it")
     root = places.find_run(run, options.runs)
-    chosen = model or models.default_model(root)
+    chosen = model or RunFolder(root).default_model()
     share = _parse_share(sd) if sd else 0.0
     if not options.json:
         # A new proposal closes forecasts that a recorded trial has followed: compare these first.

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 R = TypeVar("R", bound="Result")
 
+BASE = "base"
+"""Name of the model that all others extend."""
 INGESTED = ("ingest/trials.parquet", "ingest/samples.parquet", "ingest/session.json")
 FILTERED = ("filter/kinematics.parquet", "filter/filter.json")
 """Files that the stages ingest and filter leave for others."""
@@ -76,7 +78,17 @@ class RunFolder:
     def models(self, file: str = "model.toml") -> tuple[str, ...]:
         """Return the models that have ``file``: parents before children, then by name."""
         found = (path.parent.name for path in self.root.glob(f"models/*/{file}"))
-        return tuple(sorted(found, key=lambda name: (name != "base", name.count("+"), name)))
+        return tuple(sorted(found, key=lambda name: (name != BASE, name.count("+"), name)))
+
+    def default_model(self) -> str:
+        """Return the best confirmed model, as the stage compare stores it, else the base model."""
+        from bampipe.results.compare import CompareResult  # its schema is slow to import
+
+        try:
+            best = self.read(CompareResult).best
+        except InputError:  # it is missing or damaged, and compare will make it again
+            return BASE
+        return best if best in self.models() else BASE
 
     def glob(self, pattern: str) -> tuple[str, ...]:
         """Return the files that match ``pattern``, relative to the run folder, sorted."""

@@ -98,5 +98,4 @@ def _numbers_of(path: Path, is_log: bool) -> Iterator[tuple[str, float, str]]:
     else:
         said = text.above_samples(path) if is_text(path.name) else ""
     for match in chain.from_iterable(map(_STATEMENT.finditer, said.splitlines())):
-        unit_of = match["of"] or match["unit"] or ""
-        yield match["name"], float(match["value"]), unit_of
+        yield match["name"], float(match["value"]), match["of"] or match["unit"] or ""

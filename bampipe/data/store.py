@@ -16,6 +16,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from bampipe.data.readers.trial import check_columns
 from bampipe.errors import InputError
 from bampipe.files import atomic_writer
 
@@ -107,11 +108,7 @@ def _read_table(path: Path, columns: Sequence[str] | None, trial: str | None) ->
     with _damage_named(path), pq.ParquetFile(path, metadata=metadata, memory_map=False) as file:
         names = file.schema_arrow.names
         wanted = list(columns) if columns is not None else names
-        for name in [*wanted, *(["trial_id"] if trial is not None else [])]:
-            if name not in names:
-                raise InputError(
-                    f"no column '{name}'", where=str(path), remedy=f"it has {', '.join(names)}"
-                )
+        check_columns(names, [*wanted, *["trial_id"] * (trial is not None)], str(path))
         if trial is None:
             return file.read(columns=wanted).select(wanted)
         if trial not in by_trial:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.arrays import Array
+from bampipe.data.readers.trial import check_columns
 from bampipe.data.session import Session
 from bampipe.errors import InputError
 
@@ -73,17 +74,20 @@ class StreamLayout:
         known += [(e.column, f"q_{e.name}", e.scale, -e.zero * e.scale) for e in session.encoders]
         known += [(b.column, f"brake_{b.axis}", 1.0, 0.0) for b in session.brakes]
         known += [(c.column, c.name, c.scale, c.offset) for c in session.channels]
-        columns, names, scales, offset = map(list, zip(*known, strict=True))
-        gain = np.diag(scales)
+        columns, names, scales, offsets = map(list, zip(*known, strict=True))
+        gain, offset = np.diag(scales), np.array(offsets)
+        axes = slice(1, 1 + len(session.encoders))
+        gain[axes, axes] = gain[axes, axes] @ session.positions_by_reading.T
+        offset[axes] = session.positions_by_reading @ offset[axes]
         if force := session.force:
             matrix = np.array(force.calibration).T
             gain = np.pad(gain, ((0, len(force.columns)), (0, len(force.names))))
             gain[len(known) :, len(known) :] = matrix
-            offset += (-np.array(force.zero) @ matrix).tolist()
+            offset = np.append(offset, -np.array(force.zero) @ matrix)
             columns, names = [*columns, *force.columns], [*names, *force.names]
         may_lack = np.zeros(len(columns), dtype=bool)
-        may_lack[1 : 1 + len(session.encoders)] = True
-        return StreamLayout(tuple(columns), tuple(names), gain, np.array(offset), may_lack)
+        may_lack[axes] = True
+        return StreamLayout(tuple(columns), tuple(names), gain, offset, may_lack)
 
 
 @dataclass
@@ -163,13 +167,7 @@ class SampleStream:
         found = [cell.strip().strip("\"'") for cell in line.split(self._delimiter)]
         fitting = [layout for layout in self.layouts if set(layout.columns) <= set(found)]
         if not fitting:
-            wanted = self.layouts[0].columns
-            missing = next(name for name in wanted if name not in found)
-            raise InputError(
-                f"no column {missing!r} in the header",
-                where=f"{self.name}: line {self._line}",
-                remedy=f"the columns must be {', '.join(wanted)}",
-            )
+            check_columns(found, self.layouts[0].columns, f"{self.name}: line {self._line}")
         self._layout, self._width, self._last_good = fitting[0], len(found), self._line
         self._places = tuple(found.index(name) for name in fitting[0].columns)
 
@@ -181,9 +179,7 @@ class SampleStream:
         with np.errstate(over="ignore", invalid="ignore"):
             values = np.where(lost, 0.0, raw) @ layout.gain + layout.offset
             large = ~(np.abs(values) <= LARGEST)
-        # A missing position stays missing and spoils nothing else.
-        shared = slice(min(lost.shape[1], values.shape[1]))
-        values[:, shared][lost[:, shared]] = np.nan
+        values[lost @ (layout.gain != 0.0)] = np.nan  # and spoils nothing else
         good = numeric.all(axis=1) & ~large.any(axis=1)
         time = np.where(good, raw[:, 0] * layout.gain[0, 0], -np.inf)
         before = np.maximum.accumulate(np.append(self._last, time))

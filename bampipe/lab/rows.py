@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from bampipe.data import lab_tables, store
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import BASE, RunFolder
 from bampipe.errors import InputError
 from bampipe.phrases import diagnosis as phrases
 from bampipe.results.diagnose import DiagnoseResult
@@ -74,8 +74,8 @@ def read_run(root: Path) -> SessionRows:
     run_record = record.read(root)
     states = [trial["status"] for trial in rows.tables.get("quality", ())]
     verdicts = [gate.state for gate in run_record.gates]
-    counting = models.default_model(root)
-    had, has = (models.read(root, m).effects if m in made else () for m in (models.BASE, counting))
+    counting = run.default_model()
+    had, has = (models.read(root, m).effects if m in made else () for m in (BASE, counting))
     rows.add(
         "sessions",
         sample_rate_hz=session.sample_rate_hz,

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from bampipe.data.run_folder import BASE
 from bampipe.lab.control_chart import FEWEST_SESSIONS, make_chart
 from bampipe.lists import join_names
 from bampipe.phrases import lab as phrases
@@ -20,7 +21,6 @@ from bampipe.results.lab import (
     SessionVerdict,
     TrendsResult,
 )
-from bampipe.run.models import BASE
 
 TableRow = Mapping[str, Any]
 Tables = Mapping[str, Sequence[TableRow]]

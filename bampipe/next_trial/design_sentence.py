@@ -8,6 +8,7 @@ import numpy as np
 from bampipe.lists import join_names
 from bampipe.next_trial.primitives import PEAK, Envelope, Example, Primitive, Stroke, find_beyond
 from bampipe.physics.device import Coordinate, Device
+from bampipe.results.rounding import rounded
 
 _REPEATED_FROM = 1.2
 """A design longer than this times the imitated trial repeats it."""
@@ -91,13 +92,8 @@ def _say_example(design: Primitive, example: Example, device: Device) -> str:
 
 def _format_speed(value: float, unit: str) -> str:
     if unit == "rad":
-        return f"{_two_digits(math.degrees(value))}°/s"
-    return f"{_two_digits(1e3 * value)} mm/s"
-
-
-def _two_digits(value: float) -> str:
-    """Return a number rounded to two significant digits."""
-    return f"{float(f'{value:.2g}'):g}"
+        return f"{rounded(math.degrees(value))}°/s"
+    return f"{rounded(1e3 * value)} mm/s"
 
 
 def _say_beyond(design: Primitive, seen: Envelope, axes: Sequence[Coordinate]) -> str:
@@ -120,7 +116,7 @@ def _say_gentle(stroke: Stroke, unit: str) -> str:
         text = f"{_round(math.degrees(middle), 0)}° ± {_round(math.degrees(half), 0)}°"
     else:
         text = f"{_round(1e3 * middle, 0)} ± {_round(1e3 * half, 0)} mm"
-    return f"{text} in {_two_digits(stroke.typical_s)} s each way".replace("-", "−")
+    return f"{text} in {rounded(stroke.typical_s)} s each way".replace("-", "−")
 
 
 def _round(value: float, digits: int) -> str:

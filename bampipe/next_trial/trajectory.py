@@ -189,12 +189,12 @@ class Points:
             head = ["t", *(f"{n}_{a}" for n in ("q", "qd", "qdd", "effort") for a in self.axes)]
             rows = np.column_stack([self.t, *self.columns])
             return "\n".join(
-                [",".join(head), *(",".join(map(_format_number, row)) for row in rows), ""]
+                [",".join(head), *(",".join(map("{:.9g}".format, row)) for row in rows), ""]
             )
         points = []
         for k, t in enumerate(self.t):
             sec, nanosec = divmod(round(1e9 * float(t)), 10**9)
-            values = [[float(_format_number(v)) for v in column[k]] for column in self.columns]
+            values = [[float(f"{v:.9g}") for v in column[k]] for column in self.columns]
             clock = {"time_from_start": {"sec": sec, "nanosec": nanosec}}
             points.append(dict(zip(_POINT_FIELDS, values, strict=True)) | clock)
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
@@ -206,7 +206,3 @@ class Points:
         lines = [f"# trajectory_msgs/msg/JointTrajectory. {sentence}"]
         lines += [f"header: {json.dumps(header)}", f"joint_names: {json.dumps(joints)}", "points:"]
         return "\n".join([*lines, *(f"- {json.dumps(one)}" for one in points), ""])
-
-
-def _format_number(value: float) -> str:
-    return f"{value:.9g}"

@@ -17,7 +17,10 @@ from bampipe.physics.vocabulary import constant_symbol
 
 
 class _Notation(StrPrinter):  # type: ignore[misc]
-    """Sympy's text, with ``^`` for powers and spaces for products."""
+    """Sympy's text, with ``^`` for powers, spaces for products and four digits of a number."""
+
+    def _print_Float(self, expr: Any) -> str:
+        return f"{float(expr):.4g}"
 
     def _print_Pow(self, expr: Any, rational: bool = False) -> str:
         return super()._print_Pow(expr, rational).replace("**", "^")

@@ -131,8 +131,7 @@ class Results:
         """The model shown in detail."""
         if self.detail_model:
             return self.require_model(self.detail_model)
-        compared = self.read(CompareResult)
-        return compared.best if compared and compared.best in self.models else "base"
+        return RunFolder(self.root).default_model()
 
     def state_undone(self, said: str, stage: str) -> str:
         """Return the sentence on a stage that has not run, with the command that runs it."""

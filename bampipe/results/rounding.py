@@ -29,6 +29,11 @@ def significant(value: float, digits: int = 3) -> str:
     return f"{value:.{max(0, digits - 1 - size)}f}"
 
 
+def rounded(value: float, digits: int = 2) -> str:
+    """Return ``value`` rounded to ``digits`` significant digits, without trailing zeros."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
 def power_for(value: float, sd: float | None) -> int:
     """Return the power of ten to factor out of ``value`` and ``sd``; 0 if none is needed."""
     largest = max((abs(x) for x in (value, sd or 0.0) if math.isfinite(x)), default=0.0)

@@ -4,8 +4,10 @@ import importlib.metadata
 import importlib.util
 import platform
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import bampipe
 from bampipe.errors import InputError
@@ -25,9 +27,9 @@ ABSENT = "absent"
 def session_files(folder: Path) -> dict[str, Path]:
     """Return the files of a session, by the name that the session file gives them.
 
-    These are ``session.toml``, the trial files and, if the session has its own device file, that
-    file and the URDF that it names. Only files inside the session folder count, since ingest
-    refuses others.
+    These are ``session.toml``, the trial files with their parts and, if the session has its own
+    device file, that file and the drawing that it names. Only files inside the session folder
+    count, since ingest refuses others.
     """
     session = folder / "session.toml"
     files = {"session.toml": session}
@@ -35,26 +37,26 @@ def session_files(folder: Path) -> dict[str, Path]:
         content = read_toml(session)
     except InputError:  # ingest reports its fault
         return files
-    trials, device = content.get("trials"), content.get("device")
-    entries = trials if isinstance(trials, list) else []
-    names = [trial.get("file") for trial in entries if isinstance(trial, dict)]
-    if isinstance(device, str) and device.endswith(".toml"):
-        names += [device, *_urdf_of(folder, device)]
-    for name in names:
-        # The session file may say ./a.csv for a.csv.
-        if isinstance(name, str) and is_inside(folder, PurePosixPath(name).as_posix()):
-            files[name] = folder / name
-    return files
+    trials, device = _list_tables(content.get("trials")), content.get("device")
+    parts = [part for trial in trials for part in _list_tables(trial.get("parts"))]
+    named = (entry.get("file") for entry in (*trials, *parts))
+    names = [name for name in named if isinstance(name, str)]
+    if isinstance(device, str) and device.endswith(".toml") and _is_inside(folder, device):
+        from bampipe.data.device_file import find_robot_file  # slow to import
+
+        names.append(device)
+        with suppress(InputError):  # ingest reports its fault
+            if drawing := find_robot_file(folder / device):
+                names.append(drawing.relative_to(folder).as_posix())
+    return files | {name: folder / name for name in names if _is_inside(folder, name)}
 
 
-def _urdf_of(folder: Path, device: str) -> list[str]:
-    """Return the URDF that a session's device file names, as a path in the session folder."""
-    try:
-        robot = read_toml(folder / device).get("robot")
-    except InputError:  # ingest reports its fault
-        return []
-    urdf = robot.get("urdf") if isinstance(robot, dict) else None
-    return [str(PurePosixPath(device).parent / urdf)] if isinstance(urdf, str) else []
+def _is_inside(folder: Path, name: str) -> bool:
+    return is_inside(folder, PurePosixPath(name).as_posix())  # it may say ./a.csv for a.csv
+
+
+def _list_tables(value: object) -> list[dict[str, Any]]:
+    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
 def digest_session(folder: Path) -> dict[str, str]:

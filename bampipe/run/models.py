@@ -6,14 +6,12 @@ A missing or damaged model raises `InputError`, which names the existing ones.
 import tomllib
 from pathlib import Path
 
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import BASE, RunFolder
 from bampipe.declarations.model import ModelFile, read_model_file
 from bampipe.errors import InputError, choose_from
 from bampipe.files import digest_bytes, read_toml, write_text
-from bampipe.results.compare import CompareResult
 from bampipe.results.ingest import IngestResult
 
-BASE = "base"
 _LONGEST = 160
 """Characters of a name that lists its effects; a file system takes 255."""
 ADOPTED = "effects"
@@ -33,19 +31,7 @@ def choose_model(root: Path, name: str) -> str:
     """Return ``name``, or the default model if it is empty."""
     if name:
         read(root, name)
-    return name or default_model(root)
-
-
-def default_model(root: Path) -> str:
-    """Return the default model: the best confirmed one.
-
-    The stage compare stores it; without a comparison it is the base model.
-    """
-    try:
-        best = RunFolder(root).read(CompareResult).best
-    except InputError:  # it is missing or damaged, and compare will make it again
-        return BASE
-    return best if best in RunFolder(root).models() else BASE
+    return name or RunFolder(root).default_model()
 
 
 def write(root: Path, model: ModelFile) -> None:

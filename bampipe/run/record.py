@@ -13,6 +13,13 @@ from bampipe.run.lock import hold
 FILE = RunResult.FILE
 
 
+def find_folder(name: str | Path, runs: Path) -> Path | None:
+    """Return the run folder: a bare name is first of all one in ``runs``, anything else a path."""
+    path = Path(name)
+    places = (runs / path, path) if path.name == str(name) else (path, runs / path)
+    return next((place for place in places if (place / FILE).is_file()), None)
+
+
 def read(root: Path) -> RunResult:
     """Return ``run.json`` in ``root``, or an empty record.
 

@@ -116,7 +116,7 @@ class _Runner:
         if not self.request.judge:
             self.state.save()
             return Outcome(self.root, "done", tuple(results))
-        judged = self.request.model or models.default_model(self.root)
+        judged = self.request.model or self.state.folder.default_model()
         baseline = self.request.accepted or accepted.accepted_folder(self.root.parent)
         found = (judge_gates(gate, self.root, judged, baseline) for gate in pipeline.gates)
         verdicts = tuple(verdict for of_gate in found for verdict in of_gate)

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import BASE, RunFolder
 from bampipe.errors import InputError, MissingResultError
 from bampipe.files import digest_content, digest_file, digest_input
 from bampipe.results.run import SESSION
-from bampipe.run import hashing, models, record
+from bampipe.run import hashing, record
 from bampipe.run.request import Request, Step
 from bampipe.schema import refusal
 from bampipe.stages import base
@@ -186,13 +186,13 @@ class RunState:
             return (Step(stage),)
         if self.request.model:
             return (Step(stage, self.request.model),)
-        counting = models.default_model(self.root)
+        counting = self.folder.default_model()
         children = (
             name
-            for name in RunFolder(self.root).models()
-            if name != models.BASE and (name == counting or Step(stage, name).name in self.records)
+            for name in self.folder.models()
+            if name != BASE and (name == counting or Step(stage, name).name in self.records)
         )
-        return (Step(stage, models.BASE), *(Step(stage, name) for name in children))
+        return (Step(stage, BASE), *(Step(stage, name) for name in children))
 
     # Storage
 

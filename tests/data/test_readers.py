@@ -112,7 +112,7 @@ def test_a_bad_cell_is_found_in_any_block(tmp_path, monkeypatch, blank):
         (b"a,b\n1,2.5\n3,4", 1, True), (b"a,b\n1,2.5\n3,", 1, True), (b"a,b\n1,2.5\n3", 1, True),
         (b"a,b\n1,2.5\n3\n", 1, True), (b"a,b\n1,2\n3,4", 1, True),
         (b"a,b\r\n1,2.5\r\n3,4.", 1, True), (b"a,b\r\n1,2.5\r\n3,4.5\r\n\r\n", 2, False),
-        (b"a,b\n1,2", 1, False),
+        (b"a,b\n1,2", 1, False), (b"a;b\n1;2,55\n3;4,5", 1, True), (b"a  b\n1  2.5\n3 ", 1, True),
         (b"a,b\n1,2.5\n3,4.5\n" + bytes(9), 2, False),  # space that a logger reserved
         (b"a,b\n1,2.5\n" + b"3,4.5\n" * 20_000 + b"3" + bytes(999), 20_001, True),
     ],

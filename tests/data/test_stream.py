@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bampipe.data.session import read_session
+from bampipe.data.quality.channels import part_readings
+from bampipe.data.session import read_session, session_from
 from bampipe.data.stream import SampleStream, StreamLayout
 from bampipe.errors import InputError
 
@@ -118,3 +119,21 @@ def test_raw_columns_of_a_session_become_si():
     assert [found[f"brake_{axis}"] for axis in ("yaw", "pitch", "extension")] == [1.0, 2.0, 3.0]
     forces = [found[f"force_{component}"] for component in "xyz"]
     np.testing.assert_allclose(forces, [12.0, 0.1, -0.05], atol=1e-12)
+
+
+def test_motors_that_several_joints_turn_give_the_positions_of_these():
+    table = {
+        "schema": "bampipe.session/1", "session_id": "s", "device": "d", "sample_rate_hz": 100,
+        "time": {"column": "t", "unit": "s"}, "trials": [{"file": "a.csv", "kind": "free"}],
+        "encoders": {
+            "one": {"column": "a", "unit": "rad"},
+            "two": {"column": "b", "unit": "rad", "zero_counts": 1.0, "also_reads": {"one": 2.0}},
+        },
+    }  # fmt: skip
+    session = session_from(table, Path())
+    rows = Pipe((StreamLayout.of_session(session),)).write("t,a,b\n0,0.1,1.4\n1,0.2,\n2,,1.5\n")
+    np.testing.assert_allclose(rows[:, 1], [0.1, 0.2, np.nan])
+    np.testing.assert_allclose(rows[:, 2], [0.2, np.nan, np.nan], atol=1e-12)
+    si = {"q_one": np.array([0.1, 0.2]), "q_two": np.array([0.4, 0.7])}
+    part_readings(session, si)
+    np.testing.assert_allclose(si["q_two"], [0.2, 0.3])

@@ -1,7 +1,6 @@
 """URDF files: chains, what hangs beside them, and what is refused, with a remedy."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -287,24 +286,16 @@ def test_gravity_is_that_of_the_root_above_the_base(
     assert given.robot.gravity == (0.0, 9.81, 0.0)
 
 
-def test_a_session_depends_on_its_urdf(tmp_path: Path) -> None:
+def test_a_session_depends_on_its_urdf_and_on_parts_of_its_trials(tmp_path: Path) -> None:
     device_of(tmp_path)
-    (tmp_path / "session.toml").write_text('device = "device.toml"\n')
+    trials = '[[trials]]\nfile = "a.csv"\n[[trials.parts]]\nfile = "./b.csv"\n'
+    (tmp_path / "session.toml").write_text(f'device = "device.toml"\n{trials}')
     before = digest_session(tmp_path)
     write(tmp_path, *ARM, link("weight", 3.0), joint("grip", "tool", "weight", "fixed"))
+    (tmp_path / "b.csv").write_text("t,u\n")
     after = digest_session(tmp_path)
-    assert {name for name in after if after[name] != before[name]} == {"session:arm.urdf"}
-
-
-def test_an_encoder_that_reads_two_joints_gives_the_position_of_its_own() -> None:
-    from bampipe.data.quality.channels import part_readings
-
-    reads = {"one": {}, "two": {"one": 1.0}}
-    encoders = [SimpleNamespace(name=name, also_reads=also) for name, also in reads.items()]
-    si = {"q_one": np.array([0.1, 0.2]), "q_two": np.array([0.4, 0.7])}
-    part_readings(SimpleNamespace(encoders=encoders), si)  # type: ignore[arg-type]
-    np.testing.assert_allclose(si["q_one"], [0.1, 0.2])
-    np.testing.assert_allclose(si["q_two"], [0.3, 0.5])
+    changed = {name for name in after if after[name] != before[name]}
+    assert changed == {"session:arm.urdf", "session:./b.csv"}
 
 
 FOLLOWS = '<mimic joint="{}" multiplier="{}" offset="{}"/></joint>'

@@ -14,7 +14,6 @@ from bampipe.progress import silent
 from bampipe.results.compare import CompareResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.validate import ValidateResult
-from bampipe.run import models
 from bampipe.stages import compare
 
 
@@ -41,7 +40,7 @@ def test_the_best_confirmed_model_counts(tmp_path: Path) -> None:
     assert {rung.model: rung.confirmed for rung in found.ladder} == dict.fromkeys(
         RunFolder(tmp_path).models(), True
     )
-    assert found.best == models.default_model(tmp_path) == "base+a.yaw+b.yaw"
+    assert found.best == RunFolder(tmp_path).default_model() == "base+a.yaw+b.yaw"
 
 
 @pytest.mark.parametrize(
@@ -58,7 +57,7 @@ def test_a_child_that_is_no_better_does_not_count(tmp_path: Path, errors: dict[s
     add(tmp_path, "base+a.yaw+b.yaw", "base+a.yaw", yaw=0.1, pitch=0.1)
     found = compared(tmp_path)
     assert [rung.confirmed for rung in found.ladder] == [True, False, False]
-    assert found.best == models.default_model(tmp_path) == "base"
+    assert found.best == RunFolder(tmp_path).default_model() == "base"
 
 
 def test_a_child_whose_floor_is_lost_does_not_count(tmp_path: Path) -> None:
@@ -78,7 +77,7 @@ def test_a_damaged_ladder_is_as_none(tmp_path: Path) -> None:
     add(tmp_path, "base+a.yaw", "base", yaw=0.2)
     compared(tmp_path)
     (tmp_path / CompareResult.FILE).write_text("{")
-    assert models.default_model(tmp_path) == "base"
+    assert RunFolder(tmp_path).default_model() == "base"
 
 
 @pytest.mark.parametrize("error", [0.2, 0.5])

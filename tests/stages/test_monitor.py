@@ -224,7 +224,7 @@ def test_follows_a_growing_file_until_told_to_stop(run: RunFolder, tmp_path: Pat
 @pytest.mark.parametrize(
     ("text", "options", "said"),
     [
-        ("t,q_yaw\n", [], "no column 'q_pitch' in the header"),
+        ("t,q_yaw\n", [], "line 1: no column 'q_pitch'"),
         ("", ["--run", "nothing"], "exclude each other"),
     ],
 )

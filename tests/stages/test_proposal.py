@@ -497,9 +497,9 @@ def test_units_at_the_end_of_names_and_what_slides(tmp_path):
     assert "driven by a current" in proposal.device
     session, proposal = proposed_for(labelled("t,dist,w,forc"), tmp_path / "b")
     assert session["force"]["unit"] == "N" and "linear axis" in " ".join(proposal.check)
-    assert "linear axis" in " ".join(
-        proposed_for(labelled("t,lift.pos,w,force"), tmp_path / "d")[1].check
-    )
+    for n, head in enumerate(("t,lift.pos,w,force", "t,pos_x,w,current")):
+        proposal = proposed_for(labelled(head), tmp_path / f"d{n}")[1]
+        assert "linear axis" in " ".join(proposal.check)
     current = labelled("t,Pos.AngleValue,w,Pos.MotorCurrent")
     assert "driven by a current" in proposed_for(current, tmp_path / "e")[1].device
     session, _ = proposed_for(labelled("timer,stage pos mm,w,push_gf"), tmp_path / "c")

@@ -579,10 +579,11 @@ def test_zeros_of_a_log_from_the_motors_side(tmp_path: Path) -> None:
 
 def test_what_nothing_tells_of_counts_currents_and_shares_is_asked_once(tmp_path: Path) -> None:
     table = write_log(tmp_path)
-    share = table.rename(columns={"tau1": "tau1 (%)", "tau2": "tau2 (%)"})
-    share.to_parquet(tmp_path / "log.parquet")
-    (asked,) = propose(tmp_path).fill_in
-    assert asked.startswith("the scale of torque_shoulder and torque_elbow, N.m for one %")
+    for name, per in (("tau{} (%)", "%"), ("torque_pct_{}", "pct")):
+        share = table.rename(columns={f"tau{n}": name.format(n) for n in (1, 2)})
+        share.to_parquet(tmp_path / "log.parquet")
+        (asked,) = propose(tmp_path).fill_in
+        assert asked.startswith(f"the scale of torque_shoulder and torque_elbow, N.m for one {per}")
     table[["q1", "q2"]] = np.rint(652.0 * table[["q1", "q2"]])
     table.columns = table.columns.str.replace("tau", "current")
     table.to_parquet(tmp_path / "log.parquet")

@@ -7,9 +7,7 @@ import numpy as np
 from bampipe.arrays import find_runs
 from bampipe.data.quality.table import TrialTable, longest_run
 from bampipe.data.session import SECONDS, Channel, Encoder, Register, Session
-from bampipe.data.session.channels import LARGEST_CONDITION
 from bampipe.data.units import unit
-from bampipe.errors import InputError
 from bampipe.lists import count_noun
 from bampipe.results.ingest import DeadStretch
 
@@ -170,19 +168,9 @@ def part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
     """Take the positions of joints out of the readings of motors that several of them turn."""
     if not any(encoder.also_reads for encoder in session.encoders):
         return
-    place = {encoder.name: i for i, encoder in enumerate(session.encoders)}
-    reads = np.eye(len(place))
-    for encoder in session.encoders:
-        for other, share in encoder.also_reads.items():
-            reads[place[encoder.name], place[other]] = share
-    if not np.linalg.cond(reads) < LARGEST_CONDITION:
-        raise InputError(
-            "the readings do not give the positions: some motion shows in none of them",
-            where="session.toml: encoders.*.also_reads",
-        )
-    readings = np.stack([si[f"q_{axis}"] for axis in place])
-    for axis, values in zip(place, np.linalg.solve(reads, readings), strict=True):
-        si[f"q_{axis}"] = values
+    names = [f"q_{encoder.name}" for encoder in session.encoders]
+    positions = session.positions_by_reading @ np.stack([si[name] for name in names])
+    si |= dict(zip(names, positions, strict=True))
 
 
 def to_signed(table: TrialTable, source: Channel | Encoder) -> None:

@@ -122,14 +122,11 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
     values = {}
     for column, each in fields.items():
         stream = of[column]
-        if each.is_time:
-            values[column] = moments.seconds(base)
-        elif stream is leading:
-            values[column] = np.array(stream.cells[column], dtype=np.float64)
-        else:
+        found = moments.seconds(base) if each.is_time else np.array(stream.cells[column], float)
+        if stream is not leading:
             at, since = ((x - base[0]) / moments.NANOSECONDS for x in (base, times[stream]))
-            cells = np.array(stream.cells[column], dtype=np.float64)
-            values[column] = trial.interpolated(at, since, cells)
+            found = trial.interpolated(at, since, found)
+        values[column] = found
     remarks = [_left_out(topic, streams, times) for topic in {s.topic for s in times}]
     for stream in times:
         if stream is not leading:

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from pyarrow import dataset
 
 from bampipe.data.readers import lerobot, moments
-from bampipe.data.readers.arrays import LARGEST_WIDTH, ArrayReader, Opened, Stored
+from bampipe.data.readers.arrays import LARGEST_WIDTH, ArrayReader, Opened, Stored, stored
 from bampipe.data.readers.nested import leaves
 from bampipe.data.readers.trial import NUMBER, RawTrial, Wanted
 from bampipe.data.units import SCALES, in_steps, units_beside
@@ -64,9 +64,9 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         numbers = pa.types.is_list(field.type) and _KINDS["f"][:2]
         if numbers and field.name not in taken and any(x(field.type.value_type) for x in numbers):
             cells = read_column(field.name).cast(pa.list_(pa.float64()))
-            for k, size in enumerate(pc.list_value_length(cells).to_pylist()):
-                load = partial(_values_of_row, cells, k)
-                found[f"trial{k}.{field.name}"] = Stored((size,), "f", load)
+            for k, row in enumerate(cells):
+                values = row.values.to_numpy(zero_copy_only=False) if row.is_valid else np.empty(0)
+                found[f"trial{k}.{field.name}"] = stored(values)
     yield found, ()
 
 
@@ -84,10 +84,6 @@ def columns(path: Path) -> dict[str, str]:
     found = READER.columns(path)
     numbers = lerobot.NO_READINGS if lerobot.EPISODE in found else ()
     return {name: unit for name, unit in found.items() if name not in numbers}
-
-
-def _values_of_row(cells: pa.ChunkedArray, row: int) -> np.ndarray:
-    return np.asarray(cells[row].values.to_numpy(zero_copy_only=False))
 
 
 def _cells(

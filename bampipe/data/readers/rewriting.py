@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import count, pairwise
 from typing import Any
 
-from bampipe.data.readers.dialect import cells
+from bampipe.data.readers.heads import cells
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER
 from bampipe.data.units import unit
@@ -118,9 +118,9 @@ def find_form(head: str) -> Form | None:
     if found := _of_program(head, whole):
         return found
     ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
-    if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
-        return Form("", lambda line: line.removesuffix(";"))
-    if re.fullmatch(r"[^\[]*\]\s*;?\s*", lines[-1]):  # of a matrix of MATLAB
+    apart = all(re.search(r"[,\t |]", line) for line in ended)
+    of_matrix = re.fullmatch(r"[^\[]*\]\s*;?\s*", lines[-1])  # of MATLAB
+    if of_matrix or (2 * len(ended) > len(lines) and apart):
         return Form("", lambda line: re.sub(r"^\s*\[|[\s;]*\]?[\s;]*$", "", line))
     if _are(_STAMPED, lines):
         return _stamped(lines)
@@ -138,12 +138,11 @@ def find_form(head: str) -> Form | None:
         table = [cells(line, delimiter) for line in (*whole[:_TRIED], *lines)]
         width = Counter(map(len, table)).most_common(1)[0][0]
         rows = [row for row in table if len(row) == width > 1]
-        found = None
-        if len(rows) > _MOST * len(table):
-            every = [row for row in (cells(x, delimiter) for x in whole) if len(row) == width]
-            found = _grouped(every, delimiter)
-            found = found or (_cells(rows[0], rows[1:], delimiter) if delimiter != " " else None)
-        if found:
+        if len(rows) <= _MOST * len(table):
+            continue
+        every = [row for row in (cells(x, delimiter) for x in whole) if len(row) == width]
+        of_cells = _cells(rows[0], rows[1:], delimiter) if delimiter != " " else None
+        if found := _grouped(every, delimiter) or of_cells:
             return found
     for line in (*whole[:_FEWEST], lines[-1]):
         for kind in VOCABULARY["no_tables"]:

@@ -19,7 +19,8 @@ import pyarrow.csv as pa_csv
 
 from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments, rewriting
-from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
+from bampipe.data.readers.dialect import TableLayout
+from bampipe.data.readers.heads import HEAD, NULLS, Line
 from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, need, opened
 from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError, located
@@ -74,14 +75,8 @@ def columns(path: Path, dialect: Dialect | None = None) -> dict[str, str]:
 
 
 def above_samples(path: Path) -> str:
-    """The text above the samples of a table.
-
-    Raises:
-        InputError: it is not a table.
-    """
+    """The text above the samples of a table."""
     head, dialect = _rewritten_head(path, Dialect())
-    if dialects.share_of_rows(head) < _LEAST_ROWS:
-        raise InputError("not a table")
     start = dialects.find_layout(head, (), dialect).start
     return head[:start].decode("utf-8", "replace")
 
@@ -242,13 +237,12 @@ class _Samples:
     def passes_over(self, message: str, line: Line, layout: TableLayout) -> bool:
         """Whether a word stands where a number is expected: no reading, as "OVERLOAD" says."""
         cell = _CELL.search(message)
-        word = cell[3] if cell else ""
-        if not _NO_READING.fullmatch(word) or len(self.nothing) == _MOST_WORDS:
+        if not cell or not _NO_READING.fullmatch(cell[3]) or len(self.nothing) == _MOST_WORDS:
             return False
-        self.nothing.append(word)
-        column = layout.header[int(cell[1])] if cell else ""
+        self.nothing.append(cell[3])
+        column = layout.header[int(cell[1])]
         self.notes.append(
-            f"column '{column}' says '{word}' from row {line.number} on: taken as no reading"
+            f"column '{column}' says '{cell[3]}' from row {line.number} on: taken as no reading"
         )
         return True
 
@@ -279,17 +273,17 @@ def _read_samples(stream: BinaryIO, layout: TableLayout, end: int, samples: _Sam
             _read_stretch(stream, layout, end, samples)
             return
         except pa.ArrowInvalid as error:
-            line = _faulty_line(stream, str(error), layout)
-            again = line is not None and layout.is_header(line.text)
+            line = _faulty_line(stream, str(error), samples.rows - rows, layout)
+            again = layout.is_header(line.text)
             samples.cut(rows, parts)
-            if line is not None and not again and _is_end(stream, line, end, layout):
+            if not again and _is_end(stream, line, end, layout):
                 samples.notes.append(f"row {line.number} and what follows are no samples: left out")
                 end = line.start
                 continue
-            if line is None or not (again or layout.is_chatter(line.text)):
-                if line is not None and samples.passes_over(str(error), line, layout):
+            if not (again or layout.is_chatter(line.text)):
+                if samples.passes_over(str(error), line, layout):
                     continue
-                if line is not None and samples.resumed and line.number - layout.first_line < 5:
+                if samples.resumed and line.number - layout.first_line < 5:
                     raise InputError(
                         "another table begins",
                         where=f"row {line.number}",
@@ -336,26 +330,18 @@ def _read_stretch(stream: BinaryIO, layout: TableLayout, end: int, samples: _Sam
             ).strip(b" ")
         if not whole.strip():
             continue
-        try:
-            table = pa_csv.read_csv(
-                pa.BufferReader(whole),
-                pa_csv.ReadOptions(
-                    use_threads=False, block_size=len(whole) + 1, column_names=names
-                ),
-                pa_csv.ParseOptions(delimiter=layout.delimiter),
-                pa_csv.ConvertOptions(
-                    column_types=kinds,
-                    include_columns=list(kinds),
-                    null_values=[*NULLS, *wanted.dialect.missing, *samples.nothing],
-                    strings_can_be_null=True,
-                    decimal_point=layout.decimal,
-                ),
-            )
-        except pa.ArrowInvalid as error:
-            number = re.compile(r"(?<=Row #)\d+").search(str(error))
-            row = f"{int(number[0]) + samples.rows - before}" if number else ""
-            message = re.sub(r"(?<=Row #)\d+", row, str(error), count=1)
-            raise pa.ArrowInvalid(message) from error
+        table = pa_csv.read_csv(
+            pa.BufferReader(whole),
+            pa_csv.ReadOptions(use_threads=False, block_size=len(whole) + 1, column_names=names),
+            pa_csv.ParseOptions(delimiter=layout.delimiter),
+            pa_csv.ConvertOptions(
+                column_types=kinds,
+                include_columns=list(kinds),
+                null_values=[*NULLS, *wanted.dialect.missing, *samples.nothing],
+                strings_can_be_null=True,
+                decimal_point=layout.decimal,
+            ),
+        )
         for batch in table.to_batches():
             samples.add(batch, layout.first_line + samples.rows - before)
 
@@ -400,15 +386,16 @@ _NO_READING = re.compile(r"[^\d\s\"\\][^\d\"\\]{0,19}|[-+]?1\.#\w+|#[A-Z]+[/\d!?
 """Words for no reading, numbers of old C libraries among them."""
 _MOST_WORDS = 8
 _TORN = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", re.DOTALL)
-_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", re.DOTALL)
+_CELL = re.compile(r"In CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", re.DOTALL)
 
 
-def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> Line | None:
-    """The line that Arrow complains about, which does not count blank lines; None for none."""
+def _faulty_line(stream: BinaryIO, message: str, read: int, layout: TableLayout) -> Line:
+    """The line that Arrow complains about, behind the rows ``read``: it does not count blank lines.
+
+    InputError where it complains of none.
+    """
     found = _TORN.search(message) or _CELL.search(message)
-    row = int(found[1] if found.re is _TORN else found[2] or 0) if found else 0
-    if row == 0:
-        return None
+    row = read + int(found[1] if found.re is _TORN else found[2]) if found else -1
     stream.seek(layout.start)
     at, full = layout.start, 0
     for number, line in enumerate(stream, layout.first_line):
@@ -417,14 +404,13 @@ def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> Line | 
             text = line.decode("utf-8", "replace").strip("\r\n")
             return Line(number, at, at + len(line), text)
         at += len(line)
-    return None
+    raise InputError(message)
 
 
-def _fault(message: str, layout: TableLayout, line: Line | None) -> InputError:
-    """The plain form of Arrow's message on a text file."""
-    at = [f"row {line.number}"] if line is not None else []
-    torn = _TORN.search(message)
-    if torn:
+def _fault(message: str, layout: TableLayout, line: Line) -> InputError:
+    """The plain form of Arrow's message on a line of a text file."""
+    where, cell = f"row {line.number}", _CELL.search(message)
+    if torn := _TORN.search(message):
         expected, actual, text = int(torn[2]), int(torn[3]), torn[4]
         commas = actual > expected and re.fullmatch(r'[\s"0-9,+-]*', text)
         clock = re.search(r"\d+:\d\d:\d\d,\d+", text) if layout.delimiter == "," else None
@@ -436,12 +422,9 @@ def _fault(message: str, layout: TableLayout, line: Line | None) -> InputError:
                 f"the comma in '{clock[0]}' separates columns, too: export with semicolons between"
                 " columns, or a point before the fraction of a second"
             )
-        return InputError(
-            f"{actual} cells, where the header has {expected}", where="".join(at), remedy=remedy
-        )
-    cell = _CELL.search(message)
-    if cell is None:
-        return InputError(message)
+        what = f"{actual} cells, where the header has {expected}"
+        return InputError(what, where=where, remedy=remedy)
+    assert cell is not None
     column, value = layout.header[int(cell[1])], cell[3]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     fitting = (r for r in VOCABULARY["no_numbers"] if re.fullmatch(r["cell"], value.strip()))
@@ -450,6 +433,6 @@ def _fault(message: str, layout: TableLayout, line: Line | None) -> InputError:
         remedy = 'is it the time? then say unit = "datetime" under [time]'
     return InputError(
         f"found '{shown}', expected a number",
-        where=", ".join([*at, f"column '{column}'"]),
+        where=f"{where}, column '{column}'",
         remedy=remedy.format(cell=value.strip(), decimal=layout.decimal),
     )

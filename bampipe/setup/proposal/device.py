@@ -34,7 +34,7 @@ _SCHEMA = "bampipe.device/1"
 UNKNOWN_CONSTANT = "= 1  # guess: N.m/A, gears included"
 """Stands for the torque constant of a motor until a drawing or a person tells."""
 _MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
-_MAY_TURN = " (by a force in N alone: if it turns, call its column {0}_rad or {0}_deg)"
+_MAY_TURN = " (by its name or a force in N: if it turns, call its column {0}_rad or {0}_deg)"
 _HEAD_BYTES = 1 << 16
 """Of an XML file, in which its first element is looked for."""
 _NEAR = 0.05

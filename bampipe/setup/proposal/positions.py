@@ -16,7 +16,7 @@ from bampipe.data.units import unit
 from bampipe.data.vocabulary import word_set
 from bampipe.setup.proposal.notes import Notes
 
-SLIDING, _SHARES = map(word_set, ("sliding", "shares"))
+SLIDING, TURNING, _SHARES = map(word_set, ("sliding", "turning", "shares"))
 _FORCES, _TORQUES = map(word_set, ("forces", "torques"))
 _FEWEST_COUNTS = 100
 _MOST_WILD = 0.01
@@ -59,7 +59,7 @@ def slides(column: SurveyedColumn, found: Survey) -> bool:
     if column.si:
         return column.si in ("m", "m/s")
     said, forces = set(words(column.name)), found.of("force")
-    along = bool(said & {"x", "y", "z"}) and any(is_force(f) for f in forces)
+    along = bool(said & {"x", "y", "z"}) and not said & TURNING and all(map(is_force, forces))
     return along or bool(said & SLIDING) or any(f.si == "N" for f in forces)
 
 

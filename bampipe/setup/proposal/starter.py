@@ -14,17 +14,17 @@ from bampipe.data.units import unit as unit_named
 from bampipe.data.vocabulary import word_set
 from bampipe.physics.device import KINDS
 from bampipe.physics.expression import FUNCTIONS
+from bampipe.results.rounding import rounded
 from bampipe.setup.hypotheses import MOST_TRAVEL
-from bampipe.setup.proposal.positions import in_counts
+from bampipe.setup.proposal.positions import SLIDING, TURNING, in_counts
 from bampipe.setup.sentences import sentence
 
 _NAMELESS = word_set("nameless")
 _FROM_A_MOTOR, _FROM_A_SENSOR = REFERENCE_WORDS | word_set("driven"), word_set("sensed")
-_ON_A_BENCH = word_set("sliding")
 _FASTEST_S = 2e-4
 """Time in which viscous friction stops the least mass that a simulation is asked to follow, s."""
 _YIELDS = 2e-3
-_ANGLES, _UPRIGHT = map(word_set, ("turning", "upright"))
+_UPRIGHT = word_set("upright")
 _LEAST_WEIGHT, _USUAL_GEAR = 1e-3, 10.0
 """Spread of a weight of which nothing shows, N.m; turns of a motor whose gear is not known."""
 
@@ -92,7 +92,7 @@ def weight_of(
 def _may_carry(position: SurveyedColumn, found: Survey, geared: bool) -> bool:
     """Whether an axis whose drive shows no weight is a joint all the same."""
     said, turns = set(words(re.sub(r"[\[\]]", " ", position.name))), position.si == "rad"
-    is_angle = turns or said & _ANGLES or any(c.si == "N.m" for c in found.of("force"))
+    is_angle = turns or said & TURNING or any(c.si == "N.m" for c in found.of("force"))
     if not is_angle or said & _UPRIGHT:
         return False
     travel = float(np.ptp(position.values)) * (position.scale if turns else 1.0)
@@ -136,7 +136,7 @@ def starter_device(
         rubbed = f" - abs(coil_current)*(friction_per_ampere*sgn({qd}) + viscous_per_ampere*{qd})"
         width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
     stated = drive.role != "force" or not _FROM_A_MOTOR.isdisjoint(words(drive.column))
-    bench = drive.coil or not _ON_A_BENCH.isdisjoint(words(position))
+    bench = drive.coil or not SLIDING.isdisjoint(words(position))
     # Most axes whose log names neither are driven, and the effects of drives are then candidates.
     motor = stated or not (bench or not _FROM_A_SENSOR.isdisjoint(words(drive.column)))
     listed, driven = " and ".join(constants), "driven" if motor else "prescribed"
@@ -151,14 +151,14 @@ def starter_device(
         scaled=listed and sentence("scaled", constants=listed), viscous=viscous, coulomb=coulomb,
     )  # fmt: skip
     least, spread = _least_inertia(linear, drive.coil, found), 0.6 * wide * abs(found.coulomb)
-    inertia = (*_prior(found.inertia, wide), f"lower = {least:g}")
-    offset = ("prior = 0.0", f"sd = {_rounded(spread or 20.0):g}")
+    inertia = (*_prior(found.inertia, wide), f"lower = {rounded(least)}")
+    offset = ("prior = 0.0", f"sd = {rounded(spread or 20.0)}")
     text += _parameter(f"inertia{end}", mass, inertia, "all that moves, reduced to this axis")
     text += _parameter(f"offset{end}", torque, offset, sentence("offset"))
     if weight is not None:
         meaning = "mass times gravity times distance of the centre of gravity"
         for name, size in zip(("moment", "moment_across"), weight.moments, strict=True):
-            guessed = (f"prior = {_rounded(size):g}", f"sd = {_rounded(0.2 * wide * weight.sd):g}")
+            guessed = (f"prior = {rounded(size)}", f"sd = {rounded(0.2 * wide * weight.sd)}")
             text += _parameter(name, "N.m", guessed, meaning)
     if drive.coil:
         for name, si, size in (
@@ -228,7 +228,7 @@ def _least_inertia(linear: bool, coil: bool, found: Driven) -> float:
     least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if linear else 1e-5
     least = min(least, _FASTEST_S * found.viscous) if found.viscous > 0.0 else least
     heavy = 0.3 * min(found.inertia, 1.0) if found.inertia > 0.0 else 0.3
-    return _rounded(max(least, heavy) if coil and linear else least)
+    return max(least, heavy) if coil and linear else least
 
 
 def _parameter(name: str, unit: str, guessed: tuple[str, ...], meaning: str, more: str = "") -> str:
@@ -241,8 +241,4 @@ def _prior(size: float, wide: float) -> tuple[str, str]:
     """A prior of the size found and its spread, ``wide`` times that; 100 of 1 of nothing found."""
     if size <= 0.0:
         return "prior = 1.0", "sd = 100.0"
-    return f"prior = {_rounded(size):g}", f"sd = {_rounded(wide * size):g}"
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.2g}")
+    return f"prior = {rounded(size)}", f"sd = {rounded(wide * size)}"

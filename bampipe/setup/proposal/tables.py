@@ -16,6 +16,7 @@ from bampipe.data.units import bare, spelled, unit
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
+from bampipe.results.rounding import rounded
 from bampipe.setup.proposal.matching import Match, Matcher
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
@@ -245,8 +246,8 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
     if worth is not None and column.si is not None:
         turns, sd = (column.scale * part for part in (worth.size, worth.sd))
         fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
-        fields += f", scale_sd = {_rounded(sd / turns)}"
-        of = {"column": column.name, "axis": axis.name, "turns": turns, "sd": _rounded(sd)}
+        fields += f", scale_sd = {rounded(sd / turns, 1)}"
+        of = {"column": column.name, "axis": axis.name, "turns": turns, "sd": rounded(sd, 1)}
         return entry(column.name, said, fields) + match.notes.guess(sentence("geared", **of))
     if column.name == match.geared:
         return entry(column.name, said, ", gear_ratio = 0.0") + match.notes.ask(
@@ -263,7 +264,7 @@ def _encoder(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
     if not right and worth is not None:
         return entry(column.name, UNKNOWN) + match.notes.ask(
             "position_unit_by_weight", column=column.name, axis=axis.name, size=worth.size,
-            sd=_rounded(worth.sd), turn=2.0 * np.pi * worth.size,
+            sd=rounded(worth.sd, 1), turn=2.0 * np.pi * worth.size,
         )  # fmt: skip
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
     said = (said if right else by_size) or axis.unit
@@ -324,18 +325,14 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher) -> str:
         usual = min(_COUNTS, key=lambda counts: abs(turn - counts))
         is_usual = abs(turn - usual) < max(_SURE * sd, _NEAR * usual)
         size = f"{(usual if is_usual else turn) / (2.0 * np.pi):.6g}"
-        scale_sd = "" if is_usual else f", scale_sd = {_rounded(sd / turn)}"
+        scale_sd = "" if is_usual else f", scale_sd = {rounded(sd / turn, 1)}"
         taken = f" ({usual:.0f}, as encoders have, is taken)" if is_usual else ""
-        of = {"column": column.name, "axis": axis.name, "turn": turn, "sd": _rounded(sd)}
+        of = {"column": column.name, "axis": axis.name, "turn": turn, "sd": rounded(sd, 1)}
         said = sentence("counts", **of, taken=taken, zero=worth.zero)
         return count(size, worth.zero, scale_sd) + match.notes.guess(said)
     drawn = " of what is read where the drawing has 0" if match.robot.joints else ""
     ask = match.notes.ask(f"counts_{axis.unit}", axis.name, zero=drawn)
     return count("0.0", float(np.median(column.values))) + ask
-
-
-def _rounded(sd: float) -> str:
-    return f"{float(f'{sd:.1g}'):g}"
 
 
 def _velocity_beside(axis: Coordinate, match: Matcher) -> str:
