@@ -446,7 +446,7 @@ class _Logs:
         return tuple(found)
 
     def recordings(self, trial: TrialEntry) -> list[TrialEntry]:
-        """The recordings that one text file or list of structs holds; others as they are.
+        """The recordings that one file holds; those of bags, and of parts, as they are.
 
         Raises:
             InputError: it cannot be read.
@@ -457,10 +457,11 @@ class _Logs:
         path = self.folder / trial.file
         self.scanned += path.stat().st_size
         columns = self.found[trial.file]
+        times = [c for c, u in columns.items() if role_of(c, u) == "time"]
         several = is_text(trial.file) or any("[:]." in column for column in columns)
+        several |= bool(times) and not times[0].startswith("/")  # of a bag
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
-        times = [c for c, u in columns.items() if role_of(c, u) == "time"]
         column = (times or sorted(columns, key=lambda name: "[:]." not in name))[0]
         moving = [c for c, u in columns.items() if role_of(c, u) == "position"] if times else []
         raw = self._read_one(trial.file, columns, column, *moving)
@@ -469,7 +470,8 @@ class _Logs:
             return [trial]
         wanted = {raw.first_row - 1, *(int(raw.rows[at]) for at in starts)}
         with path.open(encoding="utf-8", errors="replace") as file:
-            lines = [re.split("[,;\t]", x.strip()) for n, x in enumerate(file, 1) if n in wanted]
+            numbered = enumerate(file if is_text(trial.file) else (), 1)
+            lines = [re.split("[,;\t]", x.strip()) for n, x in numbered if n in wanted]
         for name, *axes in zip(*lines, strict=False):
             if {*words(name)} <= _AXES and words(name) and len({*axes}) > 1:
                 raise InputError(

@@ -499,6 +499,13 @@ def test_whole_numbers_are_in_steps_of_the_scale_beside_them(tmp_path):
     np.savez(tmp_path / "a.npz", **held, **beside)
     scipy.io.savemat(tmp_path / "b.mat", held | beside)
     plain = {name: values.tolist() for name, values in held.items()}
+    inner = pa.StructArray.from_arrays([pa.array(np.c_[Q, F].tolist())], ["x"])
+    table = pa.table({"state": pa.StructArray.from_arrays([inner, pa.array(Q)], ["arm", "q"])})
+    for write, name in ((pq.write_table, "k.parquet"), (feather.write_feather, "k.feather")):
+        write(table, tmp_path / name)
+        assert list(columns_of(tmp_path / name)) == ["state.q", "state.arm.x[0]", "state.arm.x[1]"]
+        column = read_trial(tmp_path / name, ["state.arm.x[1]"]).columns["state.arm.x[1]"]
+        np.testing.assert_array_equal(column, F)
     (tmp_path / "c.json").write_text(json.dumps(plain | beside))
     signals = [{"name": n, "data": plain[n], "lsb": sizes[n]} for n in held]
     signals = [{**one, "unit": units.get(one["name"])} for one in signals]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.io
 
@@ -298,6 +299,10 @@ def test_trials_in_one_file_are_told_apart(tmp_path: Path):
     head = "time_s,angle_rad,torque_Nm,trial"
     write(tmp_path / "b.csv", head, table)
     session = propose(tmp_path).session
+    frame = pd.DataFrame({"elapsed": pd.to_timedelta(np.tile(t, 3), unit="s"), "q": np.tile(u, 3)})
+    frame.assign(u=frame["q"]).to_feather(tmp_path / "a.feather")
+    assert [trial.recording for trial in survey(tmp_path).trials] == [1, 2, 3]
+    (tmp_path / "a.feather").unlink()
     assert "end_s = 3.995" in session and "start_s = 7.995" in session
     table = np.r_[table, np.zeros((50, 4))]
     write(tmp_path / "b.csv", head, table)
