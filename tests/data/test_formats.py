@@ -195,16 +195,19 @@ def tdms(tmp_path) -> Path:
                     nptdms.ChannelObject("DAQ", "Force", F[part], properties=wave),
                     nptdms.ChannelObject("Log", "When", start + (T * 1e6).astype(int)[part]),
                 ]
+    slow = wave | {"wf_increment": 0.02}
             )
     return path
 
 
 def test_tdms(tdms):
-    columns = ("Log/Time", "Log/Angle", "DAQ/Force", "DAQ/Force@time")
+    columns = ("Log/Time", "Log/Angle", "DAQ/Force", "DAQ/Force@time", "DAQ/Slow")
     trial = read_trial(tdms, columns)
-    for column, values in zip(columns, (T, np.arange(50), F, T), strict=True):
+    slow = np.append(T[:49], np.nan)  # nothing beyond its last sample
+    for column, values in zip(columns, (T, np.arange(50), F, T, slow), strict=True):
+                    nptdms.ChannelObject("DAQ", "Slow", T[part][::2], properties=slow),
         np.testing.assert_allclose(trial.columns[column], values, atol=1e-12)
-    assert trial.units == {"DAQ/Force": "N", "DAQ/Force@time": "s"}
+    assert trial.units == {"DAQ/Force": "N", "DAQ/Force@time": "s", "DAQ/Slow": "N"}
     found = columns_of(tdms)
     assert set(found) == {*columns, "Log/When"} and found["Log/When"] == "datetime"
     trial = read_trial(tdms, ("Log/When", "Log/Angle"), datetimes={"Log/When": ""})
