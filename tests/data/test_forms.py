@@ -179,7 +179,7 @@ def test_channels_go_by_the_names_beside_them(tmp_path: Path):
     np.testing.assert_array_equal(joined.columns["runs[:].q"], np.concatenate([Q, -Q]))
     with h5py.File(tmp_path / "c.h5", "w") as file:
         file["log"] = np.column_stack([T, Q, U])
-        file["log"].attrs["columns"] = ["t", "q", "u"]
+        file["log"].attrs["channel_names"] = np.array([b"t", b"q", b"u"])
     assert list(columns_of(tmp_path / "c.h5")) == ["log/t", "log/q", "log/u"]
     trial = read_trial(tmp_path / "c.h5", ("log/t", "log/u"))
     np.testing.assert_array_equal(trial.columns["log/u"], U)
