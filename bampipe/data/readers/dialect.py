@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import islice, pairwise, zip_longest
+from itertools import islice, pairwise, product, zip_longest
 
 import numpy as np
 
@@ -46,6 +46,8 @@ _SEARCHED = 200
 _TRIED = 400
 _ALIKE = 0.97
 """Share of the most numbers in cells that is as good: words above samples may hold a number."""
+_FEW_UNITS = 3
+"""Units of a line, of which each has to be known."""
 _LEAST_FILLED = 0.04
 """Least share of the first lines in which a column holds something."""
 
@@ -275,10 +277,13 @@ def _header(
         fits = len(row) in (width, width - 1)
         return row if fits else next(iter(_otherwise(lines[index].text, width)), row)
 
-    for index, line in enumerate(lines[:_SEARCHED]) if columns else ():
+    # A remark above the header may have a name among its words.
+    for whole, (index, line) in product(
+        (True, False), enumerate(lines[: _SEARCHED * any(columns)])
+    ):
         for delimiter in delimiters:
             row = names(index, delimiter)
-            if set(columns) <= set(row):
+            if set(columns) <= set(row) and (not whole or width - 1 <= len(row) <= width):
                 check_columns(row, columns, f"row {line.number}")
                 first, below = _guess(lines[index + 1 :], delimiters)[0]
                 rows = lines[index + 1 + first :]  # may be separated otherwise than the header
@@ -486,7 +491,9 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
         fitting.pop()
     for n in reversed(_filled(lines[:first])):
         row = cells(lines[n].text, delimiter)
-        begun = not cells(lines[first].text, delimiter)[0] and re.search(r"(?i)names?:?\Z", row[0])
+        begun = not cells(lines[first].text, delimiter)[0] and re.search(
+            r"(?i)(names?:?|waves/?\w?)\Z", row[0]
+        )
         if len(row) == width and (begun or _is_key_of_names(row)):
             return n
     wordy = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
@@ -606,8 +613,10 @@ def _below(text: str, header: list[str], title: str) -> list[str]:
 
 
 def _are_units(row: list[str]) -> bool:
-    """Whether every cell is a unit that is known, or stands in brackets."""
-    return any(row) and all(re.match(r"[\[(]", cell) or unit(cell) is not None for cell in row)
+    """Whether every cell is a unit that is known, or stands in brackets; one of many may not."""
+    said = [cell for cell in row if cell]
+    known = sum(bool(re.match(r"[\[(]", cell)) or unit(cell) is not None for cell in said)
+    return bool(said) and known >= len(said) - (len(said) > _FEW_UNITS)
 
 
 def _units_of_motion(above: list[str], header: list[str]) -> dict[str, str]:

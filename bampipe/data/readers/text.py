@@ -125,7 +125,9 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
             yield stream, dialect, ()
             return
         try:
-            text = stream.read().decode(encoding)
+            # Bytes of a line that broke off, as of a serial port, are no letters.
+            lenient = encoding == "utf-8" and not dialect.encoding
+            text = stream.read().decode(encoding, "replace" if lenient else "strict")
         except UnicodeDecodeError as error:
             raise InputError(
                 f"not sound {encoding.upper()} text ({error.reason})",
