@@ -207,6 +207,9 @@ def test_counters_wrap_at_any_width_and_go_on():
         np.testing.assert_allclose(np.diff(found), 37.0 * 2 ** (bits - 12))
         assert len(rows) == 4 and said == f"at {bits} bits"
     assert not len(unwrapped(np.where(np.arange(500) < 250, 0.0, 3000.0), 0.0, True)[1])
+    signed = np.rint(-9000.0 * np.cos(angle / 2000.0))  # in a register, seen first below zero
+    np.testing.assert_allclose(unwrapped(signed % 65536.0, 0.0, True)[0], signed)
+    np.testing.assert_allclose(unwrapped(signed % 65536.0, 0.0, True, 7e4)[0], signed + 65536.0)
     for half, ending in ((12.5, "25 rad"), (4 * np.pi, "four turns")):
         sent = (0.1 * angle / 37.0 + half) % (2 * half) - half
         found, rows, said = unwrapped(sent, TURN, False)
