@@ -670,8 +670,10 @@ def test_ticks_of_a_counter_and_slow_logs_are_asked_about(tmp_path):
     ):
         log = labelled(f"{name},angle_rad,w,torque_nm", t=scale)
         session, proposal = proposed_for(log, tmp_path / f"{scale:g}")
+        ("stamp", 1e7, {"unit": "ticks", "ticks_per_s": 1e7}),  # of Windows
         assert session["time"] == {"column": name, **time} and proposal.fill_in == []
     slow = {n: v[::10] for n, v in labelled("t,q,w,u").items()}
+        log[name] += 1.34e17 * (name == "stamp")
     assert "too slow for inertia" in str(proposed_for(slow, tmp_path / "b")[1].check)
 
 
@@ -713,6 +715,11 @@ def test_a_record_of_unknown_rate_is_not_cut_and_lost_rows_are_counted(tmp_path)
 
 
 def test_what_needs_a_gain_gets_wide_priors(tmp_path):
+    table |= {"sample": table["sample"] % 256.0, "fs": np.full(1580, 200.0)}
+    kept = np.delete(np.arange(1580), [99, 700])
+    table = {name: values[kept] for name, values in table.items()}
+    session, proposal = proposed_for({n: v[500:] for n, v in table.items()}, tmp_path / "c")
+    assert session["time"]["ticks_per_s"] == 200.0 == session["sample_rate_hz"]
     t, q, u = machine(5)
     for name, scale in (("torque_Nm", 1.0), ("torque_percent", 12.5)):
         proposed_for({"time_s": t, "angle_rad": q, name: scale * u}, tmp_path / name)
