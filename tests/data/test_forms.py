@@ -225,6 +225,7 @@ def test_counters_wrap_at_any_width_and_go_on():
         ("t [s],q [deg],torque [%]", "calibration_n_per_v"),
         ("t [s],q [deg],torque_percent", 'calibration_n_per_v, N.m for one of "torque_percent"'),
         ("t [s],q [deg],load cell [kg]", "lever_m"),
+        ("t [s],q [deg],current_pct", "the scale of motor_current, A for one pct"),
         ("t [s],q_deg,torque_Nm_x1000", "stated as 'Nm, x1000'"),
         ("t [s],q_deg_e3,torque_Nm", "stated as 'deg, e3'"),
         ("t [s],belt [m/s],moment [Nm]", "[Nm] is in Nm and follows the motion, but is none"),
@@ -298,15 +299,15 @@ def test_trials_in_one_file_are_told_apart(tmp_path: Path):
                 file[f"trial_{n:02d}/{name}"] = values
     assert [trial.recording for trial in survey(tmp_path).trials] == [1, 2, 3]
     (tmp_path / "a.h5").unlink()
+    frame = pd.DataFrame({"elapsed": pd.to_timedelta(np.tile(t, 3), unit="s"), "q": np.tile(u, 3)})
+    frame.assign(u=frame["q"]).to_feather(tmp_path / "a.feather")
+    assert [trial.recording for trial in survey(tmp_path).trials] == [1, 2, 3]
+    (tmp_path / "a.feather").unlink()
     number = np.repeat([1, 2, 3], 400)
     table = np.c_[np.arange(1200) / 100.0, np.tile(np.sin(3 * t), 3), np.tile(u, 3), number]
     head = "time_s,angle_rad,torque_Nm,trial"
     write(tmp_path / "b.csv", head, table)
     session = propose(tmp_path).session
-    frame = pd.DataFrame({"elapsed": pd.to_timedelta(np.tile(t, 3), unit="s"), "q": np.tile(u, 3)})
-    frame.assign(u=frame["q"]).to_feather(tmp_path / "a.feather")
-    assert [trial.recording for trial in survey(tmp_path).trials] == [1, 2, 3]
-    (tmp_path / "a.feather").unlink()
     assert "end_s = 3.995" in session and "start_s = 7.995" in session
     table = np.r_[table, np.zeros((50, 4))]
     write(tmp_path / "b.csv", head, table)

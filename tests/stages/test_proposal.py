@@ -546,6 +546,9 @@ def test_a_load_in_a_register_is_a_duty_cycle_and_no_force(tmp_path, beside: str
     assert drive["wrap_bits"] == 16 and drive["signed"]
     (ask,) = proposal.fill_in
     assert ask.startswith("the scale of duty, 1 over the reading of load at full duty")
+    session, proposal = proposed_for({"torque": table.pop("load"), **table}, tmp_path / "b")
+    (drive,) = (c for c in session["channels"].values() if c["column"] == "torque")
+    assert drive["wrap_bits"] == 16 and "driven by a force" in proposal.device
 
 
 def pendulum(names: str, q: float, u: float) -> dict[str, np.ndarray]:
@@ -667,13 +670,13 @@ def test_ticks_of_a_counter_and_slow_logs_are_asked_about(tmp_path):
     for name, scale, time in (
         ("time [0.1 ms]", 1e4, {"unit": "ticks", "ticks_per_s": 1e4}),
         ("time in cycle [ms]", 1e3, {"unit": "ms"}),
+        ("stamp", 1e7, {"unit": "ticks", "ticks_per_s": 1e7}),  # of Windows
     ):
         log = labelled(f"{name},angle_rad,w,torque_nm", t=scale)
+        log[name] += 1.34e17 * (name == "stamp")
         session, proposal = proposed_for(log, tmp_path / f"{scale:g}")
-        ("stamp", 1e7, {"unit": "ticks", "ticks_per_s": 1e7}),  # of Windows
         assert session["time"] == {"column": name, **time} and proposal.fill_in == []
     slow = {n: v[::10] for n, v in labelled("t,q,w,u").items()}
-        log[name] += 1.34e17 * (name == "stamp")
     assert "too slow for inertia" in str(proposed_for(slow, tmp_path / "b")[1].check)
 
 
@@ -712,14 +715,14 @@ def test_a_record_of_unknown_rate_is_not_cut_and_lost_rows_are_counted(tmp_path)
     session, proposal = proposed_for(table, tmp_path / "b")
     assert session["time"] == {"column": "sample", "unit": "ticks", "ticks_per_s": 0.0}
     assert "sample numbers the rows, and some are lost" in proposal.fill_in[0]
-
-
-def test_what_needs_a_gain_gets_wide_priors(tmp_path):
     table |= {"sample": table["sample"] % 256.0, "fs": np.full(1580, 200.0)}
     kept = np.delete(np.arange(1580), [99, 700])
     table = {name: values[kept] for name, values in table.items()}
     session, proposal = proposed_for({n: v[500:] for n, v in table.items()}, tmp_path / "c")
     assert session["time"]["ticks_per_s"] == 200.0 == session["sample_rate_hz"]
+
+
+def test_what_needs_a_gain_gets_wide_priors(tmp_path):
     t, q, u = machine(5)
     for name, scale in (("torque_Nm", 1.0), ("torque_percent", 12.5)):
         proposed_for({"time_s": t, "angle_rad": q, name: scale * u}, tmp_path / name)

@@ -211,7 +211,8 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
         turned = replace(driver, values=-driver.values)
         fit = _rough_fit(position, turned, role, linear, match.t)
         notes.check.append(sentence("reaction", column=driver.name))
-    drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
+    name = driver.name if driver is not None else ""
+    drive = Drive(role, name, supply is not None, coil, register=name in match.registers)
     if driver is not None:
         levered = (
             driver.si == "V" or needs_gain(driver) or (not linear and positions.is_force(driver))

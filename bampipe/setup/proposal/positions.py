@@ -17,7 +17,7 @@ from bampipe.data.vocabulary import word_set
 from bampipe.setup.proposal.notes import Notes
 
 SLIDING, _SHARES = map(word_set, ("sliding", "shares"))
-_FORCES, _TORQUES = map(word_set, ("forces", "torques"))
+_FORCES, TORQUES = map(word_set, ("forces", "torques"))
 _FEWEST_COUNTS = 100
 _MOST_WILD = 0.01
 """Largest share of the readings that may be wild or missing."""
@@ -44,7 +44,7 @@ def is_force(column: SurveyedColumn) -> bool:
     said = set(words(column.name))
     if column.si is not None:
         return column.si in ("N", "kg")
-    return bool(said & _FORCES) and not said & _TORQUES
+    return bool(said & _FORCES) and not said & TORQUES
 
 
 def needs_gain(column: SurveyedColumn) -> bool:

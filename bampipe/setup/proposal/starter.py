@@ -54,6 +54,7 @@ class Drive:
         supply: whether the supply voltage that a duty cycle is a share of is recorded too.
         coil: whether, beside a force, the current of a coil that changes the friction is.
         scaled: whether what is recorded is a force or torque at the axis, no gain or lever missing.
+        register: whether it is a register with a sign, as a channel may be.
     """
 
     role: str
@@ -61,6 +62,7 @@ class Drive:
     supply: bool = False
     coil: bool = False
     scaled: bool = True
+    register: bool = False
 
 
 def weight_of(
@@ -185,7 +187,7 @@ def _input_of(
         applied = f"torque_constant/resistance*(duty*supply - torque_constant*qd_{axis})"
         applied = "force_at_full*duty" if linear else applied
         return "duty", "", applied, {name: sentence(name) for name in names}
-    source = f"force{end or '_drive'}"
+    source = f"drive{end}" if drive.register else f"force{end or '_drive'}"
     return source, torque, source, {}
 
 
