@@ -16,6 +16,7 @@ import numpy as np
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER, Dialect, check_columns
+from bampipe.data.refusals import refusal
 from bampipe.data.units import bare, in_steps, unit, units_in
 from bampipe.data.vocabulary import word_set
 from bampipe.errors import InputError
@@ -248,11 +249,7 @@ def _lines(head: bytes) -> list[Line]:
             text = match[0].decode("utf-8")
         except UnicodeDecodeError as error:
             if number <= 2 and not any(line.text.strip() for line in found):
-                raise InputError(
-                    "the header is not UTF-8 text",
-                    where=f"row {number}",
-                    remedy='save it as UTF-8, or say encoding = "latin-1" under [csv]',
-                ) from error
+                raise refusal("header_encoding", f"row {number}") from error
             text = match[0].decode("utf-8", "replace")
         found.append(Line(number, start + match.start(), end, text.rstrip("\r\n")))
     return found
@@ -301,12 +298,8 @@ def _header(
         row = [f"{_NUMBERED}{n}" for n, _ in enumerate(cells(lines[first].text, delimiter), 1)]
         if set(columns) <= set(row):
             return max(_filled(lines[:first]), default=-1), delimiter, row
-        raise InputError(
-            "no header: the first line holds numbers",
-            where=f"row {lines[0].number}",
-            remedy=f"add a line {','.join(columns)}, or give names under [csv]; without names, the"
-            f" columns are {row[0]} to {row[-1]}",
-        )
+        place, said = f"row {lines[0].number}", ",".join(columns)
+        raise refusal("no_header", place, columns=said, first=row[0], last=row[-1])
     check_columns(row, columns, f"row {lines[index].number}")
     return index, delimiter, row
 
@@ -533,11 +526,8 @@ def _decimal(body: list[Line], header: list[str], columns: Sequence[str], delimi
             if columns and column not in columns:
                 continue
             if _GROUPED.match(cell):
-                raise InputError(
-                    f"'{cell}' groups its digits in thousands",
-                    where=f"row {line.number}, column '{column}'",
-                    remedy="export without thousands separators",
-                )
+                place = f"row {line.number}, column '{column}'"
+                raise refusal("thousands", place, cell=cell)
             if _COMMA.match(cell):
                 seen.setdefault(",", (cell, line.number))
                 plain = plain or not _THOUSANDS.match(cell)
@@ -547,16 +537,9 @@ def _decimal(body: list[Line], header: list[str], columns: Sequence[str], delimi
         return "."
     if "." in seen:
         (comma, row_1), (point, row_2) = seen[","], seen["."]
-        raise InputError(
-            f"'{comma}' in row {row_1} has a decimal comma, '{point}' in row {row_2} a point",
-            remedy='export with one decimal sign, or say decimal = "," or "." under [csv]',
-        )
+        raise refusal("two_decimals", comma=comma, row=row_1, point=point, other=row_2)
     if not plain:
-        raise InputError(
-            f"'{seen[','][0]}' may be a decimal comma or digits in thousands",
-            where=f"row {seen[','][1]}",
-            remedy='say decimal = "," under [csv], or export without thousands separators',
-        )
+        raise refusal("either_decimal", f"row {seen[','][1]}", cell=seen[","][0])
     return ","
 
 
