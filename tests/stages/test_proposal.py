@@ -716,9 +716,8 @@ def test_a_record_of_unknown_rate_is_not_cut_and_lost_rows_are_counted(tmp_path)
     assert session["time"] == {"column": "sample", "unit": "ticks", "ticks_per_s": 0.0}
     assert "sample numbers the rows, and some are lost" in proposal.fill_in[0]
     table |= {"sample": table["sample"] % 256.0, "fs": np.full(1580, 200.0)}
-    kept = np.delete(np.arange(1580), [99, 700])
-    table = {name: values[kept] for name, values in table.items()}
-    session, proposal = proposed_for({n: v[500:] for n, v in table.items()}, tmp_path / "c")
+    kept = np.delete(np.arange(500, 1580), [99, 700])
+    session, proposal = proposed_for({n: v[kept] for n, v in table.items()}, tmp_path / "c")
     assert session["time"]["ticks_per_s"] == 200.0 == session["sample_rate_hz"]
 
 
