@@ -124,11 +124,9 @@ def test_fields_of_matlab_structs(tmp_path, compressed):
         texts = (np.array([*map(ord, name)], np.uint16) for name in ("arm [deg]", "u [Nm]"))
         for key, pair in {"label": texts, "values": (Q, F)}.items():  # and an array of structs
             held = [file.create_dataset(f"#refs#/{key}{n}", data=x) for n, x in enumerate(pair)]
-            kind = b"char" if key == "label" else b"double"
             for item in held:
-                item.attrs["MATLAB_class"] = np.bytes_(kind)
-            refs = np.array([[item.ref] for item in held], h5py.ref_dtype)
-            file.create_dataset(f"log/signals/{key}", data=refs)
+                item.attrs["MATLAB_class"] = np.bytes_("char" if key == "label" else "double")
+            file[f"log/signals/{key}"] = np.array([[item.ref] for item in held], h5py.ref_dtype)
     assert columns_of(tmp_path / "b.mat")["log/signals.u Nm"] == "Nm"
     trial = read_trial(tmp_path / "b.mat", ("log.axis.q", "log/signals.u Nm"))
     np.testing.assert_array_equal(trial.columns["log.axis.q"], Q)

@@ -189,6 +189,9 @@ def test_channels_go_by_the_names_beside_them(tmp_path: Path):
     content = {"log": [{"name": n, "values": [*v, *v], "unit": u} for n, v, u in signals]}
     (tmp_path / "d.json").write_text(json.dumps(content | {"meta": {"fs": 100}}))
     assert columns_of(tmp_path / "d.json") == {"log.q": "rad", "log.u": "Nm", "meta.fs": ""}
+    runs = [{"names": ["t", "u"], "rows": np.c_[T, v].tolist()} for v in (U, -U)]
+    (tmp_path / "d.json").write_text(json.dumps({"runs": runs}))
+    assert list(columns_of(tmp_path / "d.json")) == ["runs[:].t", "runs[:].u"]
     (tmp_path / "d.json").write_text(json.dumps([{"q": f"{q:.4f}"} for q in Q]))
     np.testing.assert_array_equal(read_trial(tmp_path / "d.json", ("q",)).columns["q"], Q)
     heads = np.array(["t", "q", "u"], dtype=object)
@@ -287,8 +290,8 @@ def test_trials_in_one_file_are_told_apart(tmp_path: Path):
                 file[f"trial_{n:02d}/{name}"] = values
     assert [trial.recording for trial in survey(tmp_path).trials] == [1, 2, 3]
     (tmp_path / "a.h5").unlink()
-    frame = pd.DataFrame({"elapsed": pd.to_timedelta(np.tile(t, 3), unit="s"), "q": np.tile(u, 3)})
-    frame.assign(u=frame["q"]).to_feather(tmp_path / "a.feather")
+    frame = pd.DataFrame({"q": np.tile(u, 3), "u": 0.0}, pd.to_timedelta(np.tile(t, 3), unit="s"))
+    frame.reset_index(names="elapsed").to_feather(tmp_path / "a.feather")
     assert [trial.recording for trial in survey(tmp_path).trials] == [1, 2, 3]
     (tmp_path / "a.feather").unlink()
     number = np.repeat([1, 2, 3], 400)

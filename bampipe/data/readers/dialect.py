@@ -99,7 +99,7 @@ class TableLayout:
         count = sum(_is_number(cell, self.decimal) or is_moment(cell) for cell in row)
         # The title of a block may hold its number.
         titled = len(self.cells(text)) != len(self.header) and self.is_remark(text)
-        plain = 2 * count < len(row) if titled else not count
+        plain = 2 * count <= len(row) if titled else not count
         wordy = plain and text.expandtabs().isprintable() and any(map(str.isalpha, text))
         return wordy or _is_remark(text) or self.ends_in_words(text)
 

@@ -76,6 +76,7 @@ def unbroken(text: str) -> str:
 
     Messages as YAML with ``---`` between them, as ROS prints them, become a table.
     """
+    text = text.replace("\f", "")
     messages = re.split(r"(?m)^---\s*$", text)
     lines = messages[0].splitlines() if len(messages) > _FEWEST else []
     if lines and all(map(_OF_MESSAGE.match, lines)):
