@@ -497,10 +497,10 @@ def test_units_at_the_end_of_names_and_what_slides(tmp_path):
     assert "driven by a current" in proposal.device
     session, proposal = proposed_for(labelled("t,dist,w,forc"), tmp_path / "b")
     assert session["force"]["unit"] == "N" and "linear axis" in " ".join(proposal.check)
-    assert "linear axis" in " ".join(
-        proposed_for(labelled("t,lift.pos,w,force"), tmp_path / "d")[1].check
-    )
+    _, proposal = proposed_for(labelled("t,lift.pos,w,force"), tmp_path / "d")
+    assert "linear axis" in " ".join(proposal.check)
     current = labelled("t,Pos.AngleValue,w,Pos.MotorCurrent")
+    current["volts"] = 3.0 * current["Pos.MotorCurrent"] + 9.0 * current["w"]
     assert "driven by a current" in proposed_for(current, tmp_path / "e")[1].device
     session, _ = proposed_for(labelled("timer,stage pos mm,w,push_gf"), tmp_path / "c")
     assert session["time"]["column"] == "timer" and session["force"]["unit"] == "gf"
@@ -578,14 +578,15 @@ def test_sign_bits_of_a_servo_are_taken_off_and_its_counts_shown_by_its_weight(t
 
 @pytest.mark.parametrize(
     ("column", "unit"),
-    [("handle_force_N", "N"), ("loadcell_kN", "kN"), ("kraft", "N"), ("pull_kgf", "kgf")],
+    [("handle_force_N", "N"), ("loadcell_kN", "kN"), ("kraft", "N"), ("pull_gf", "gf")],
 )
 def test_a_force_on_a_joint_needs_a_lever(tmp_path, command: Command, column: str, unit: str):
-    scale = {"kN": 1e-3, "kgf": 1.0 / 9.80665}.get(unit, 1.0)
+    scale = {"kN": 1e-3, "gf": 1e3 / 9.80665}.get(unit, 1.0)
     session, proposal = proposed_for(labelled(f"t,angle_rad,w,{column}", u=scale / 0.31), tmp_path)
     assert (session["force"]["unit"], session["force"]["lever_m"]) == (unit, 0.0)
     (ask,) = proposal.fill_in
     assert ask.startswith("lever_m, how far from the axis") and "measure it" in ask
+    assert tomllib.loads(proposal.device)["parameters"]["inertia"]["lower"] < 0.1 * INERTIA
     code, _, err = command("ingest", tmp_path)
     assert code == 2 and "force.lever_m: found 0, expected the distance in m from the axis" in err
     text = (tmp_path / "session.toml").read_text().replace("lever_m = 0.0", "lever_m = 0.31")

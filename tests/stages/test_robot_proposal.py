@@ -321,10 +321,7 @@ def test_reductions_of_a_device_file_beside_the_logs_are_taken(tmp_path: Path) -
 def test_many_radians_of_a_motor_are_no_degrees_though_these_stay_in_the_range(
     tmp_path: Path, gain: float, dry: float
 ) -> None:
-    """A hundred turns read as degrees are 1.7 times the joint's angle; torques are of either.
-
-    Where friction takes most of the torque, it would do so at any angle.
-    """
+    """A hundred turns read as degrees are 1.7 times the joint's angle; torques are of either."""
     table = write_log(tmp_path, (gain, gain), dry=dry)
     table[["q1", "q2"]] *= 100.0
     ends = {"q1": "q1_rad", "q2": "q2_rad"} if dry > 1.0 else {}

@@ -217,6 +217,7 @@ class Matcher:
         for is_likelier in (
             lambda name: roles[name] in DRIVERS,
             lambda name: not _SUPPLIED & set(words(name)),
+            lambda name: roles[name] != "voltage",  # which goes with the speed, too
             lambda name: number and _numbers(name) == number,
             lambda name: at_motor or "motor" not in words(name) or roles[name] != "force",
         ):

@@ -80,7 +80,7 @@ def position_in_si(column: SurveyedColumn, t: np.ndarray, si: str) -> np.ndarray
 
 def scale_to(si: str, column: SurveyedColumn) -> float:
     """What brings the values of a column to ``si``, by its unit or by the likely one."""
-    if column.si == si:
+    if column.si == si or (column.si, si) == ("N", "N.m"):  # the lever is to be asked for
         return column.scale
     known = unit(guesses.likely_unit(si, column.values) or si)
     return known.scale if known is not None else 1.0

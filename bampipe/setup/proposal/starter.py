@@ -152,7 +152,7 @@ def starter_device(
         drive=sentence(driven) if motor or drive.coil else "", rate=rate, torque=torque,
         scaled=listed and sentence("scaled", constants=listed), viscous=viscous, coulomb=coulomb,
     )  # fmt: skip
-    least, spread = _least_inertia(linear, drive.coil, found), 0.6 * wide * abs(found.coulomb)
+    least, spread = _least_inertia(linear, drive.coil, found, wide), 0.6 * wide * abs(found.coulomb)
     inertia = (*_prior(found.inertia, wide), f"lower = {least:g}")
     offset = ("prior = 0.0", f"sd = {_rounded(spread or 20.0):g}")
     text += _parameter(f"inertia{end}", mass, inertia, "all that moves, reduced to this axis")
@@ -224,10 +224,10 @@ def _potential(axis: str, linear: bool, weight: Weight | None, end: str) -> str:
     return sentence("weight", axis=axis, doubt=weight.doubt or "the motion shows it")
 
 
-def _least_inertia(linear: bool, coil: bool, found: Driven) -> float:
+def _least_inertia(linear: bool, coil: bool, found: Driven, wide: float) -> float:
     # A mass near zero under friction is a motion that no simulation can follow. Where force is
     # nearly all friction the guess of the mass is not worth much: friction has the last word.
-    least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if linear else 1e-5
+    least = 0.5 / wide**2 * found.inertia if found.inertia > 0.0 else 0.1 if linear else 1e-5
     least = min(least, _FASTEST_S * found.viscous) if found.viscous > 0.0 else least
     heavy = 0.3 * min(found.inertia, 1.0) if found.inertia > 0.0 else 0.3
     return _rounded(max(least, heavy) if coil and linear else least)
