@@ -724,9 +724,10 @@ def test_a_record_of_unknown_rate_is_not_cut_and_lost_rows_are_counted(tmp_path)
 
 def test_what_needs_a_gain_gets_wide_priors(tmp_path):
     t, q, u = machine(5)
-    for name, scale in (("torque_Nm", 1.0), ("torque_percent", 12.5)):
-        proposed_for({"time_s": t, "angle_rad": q, name: scale * u}, tmp_path / name)
-        device = tomllib.loads((tmp_path / name / "device.toml").read_text())
+    named = {"torque_Nm": 1.0, "torque_percent": 9.0, "moment [Nm/kg]": 2.0, "motor_torque_Nm": 3.0}
+    for name, scale in named.items():
+        proposed_for({"time_s": t, "angle_rad": q, name: scale * u}, tmp_path / f"{scale}")
+        device = tomllib.loads((tmp_path / f"{scale}/device.toml").read_text())
         inertia = device["parameters"]["inertia"]
         assert inertia["sd"] == pytest.approx((5, 100)[scale > 1] * inertia["prior"], rel=0.05)
 
