@@ -143,7 +143,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     units |= _units_of_motion([line.text for line in lines[:index]], header)
     for line in lines[: max(index, 0)]:
         row = cells(line.text, delimiter)
-        if len(row) == len(header) and re.search(r"(?i)\bunits?:?\Z", row[0]):
+        if len(row) == len(header) and re.search(r"(?i)(\b|V)units?:?\Z", row[0]):
             units = {h: u for h, u in zip(header[1:], row[1:], strict=True) if u} | units
     remarks, scales = [], dict[str, float]()
     if delimiter != "," and not dialect.delimiter:
@@ -484,10 +484,9 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
         fitting.pop()
     for n in reversed(_filled(lines[:first])):
         row = cells(lines[n].text, delimiter)
-        begun = not cells(lines[first].text, delimiter)[0] and re.search(
-            r"(?i)(names?:?|waves/?\w?)\Z", row[0]
-        )
-        if len(row) == width and (begun or _is_key_of_names(row)):
+        sample = cells(lines[first].text, delimiter)
+        begun = not sample[0] and re.search(r"(?i)(names?:?|waves/?\w?)\Z", row[0])
+        if width - (not sample[-1]) <= len(row) <= width and (begun or _is_key_of_names(row)):
             return n
     wordy = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
     if wordy and wordy[-1] != fitting[-1]:
