@@ -96,20 +96,19 @@ def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[st
         if not isinstance(group.get(key, getlink=True), h5py.HardLink):
             yield label, None
             continue
-        item = group[key]
+        item, inner = group[key], depth + 1
+        held = {label: item}
         if isinstance(item, h5py.Dataset) and h5py.check_ref_dtype(item.dtype) is h5py.Reference:
-            # Cells, and fields of arrays of structs, as MATLAB keeps them.
-            for number, inner in enumerate(item[()].ravel()[:_MOST_DATASETS]):
-                own = f"{prefix[:-1]}[{number}].{key}" if prefix else f"{key}[{number}]"
-                if isinstance(target := group[inner], h5py.Dataset):
-                    yield own, target
-                elif depth < _DEEPEST:
-                    yield from _datasets(target, f"{own}/", depth + 1)
-        elif isinstance(item, h5py.Dataset):
-            if not item.external and not item.is_virtual:
-                yield label, item
-        elif depth < _DEEPEST:
-            yield from _datasets(item, f"{label}/", depth + 1)
+            # Cells, and fields of arrays of structs, as MATLAB keeps them; they may go in circles.
+            own = f"{prefix[:-1]}[{{}}].{key}" if prefix else f"{key}[{{}}]"
+            at = enumerate(item[()].ravel()[:_MOST_DATASETS])
+            held, inner = {own.format(n): group[x] for n, x in at if x}, _DEEPEST
+        for name, within in held.items():
+            if isinstance(within, h5py.Dataset):
+                if not within.external and not within.is_virtual:
+                    yield name, within
+            elif depth < _DEEPEST:
+                yield from _datasets(within, f"{name}/", inner)
 
 
 def _names(data: Any) -> list[str]:
