@@ -78,6 +78,7 @@ def _evidence(name: str, stated: str) -> Iterator[tuple[str, float]]:
     """Yield each role that a name or a stated unit suggests, with the weight of the evidence."""
     plain, said = name.strip(), words(name)
     clock = plain.lower() in _UNIT_WORDS["time"] or plain.lower().startswith("x_value")
+    clock |= plain.endswith("@time")  # of a signal of a bag or of LabVIEW
     if stated == "datetime" or clock or plain.rpartition(".")[2] == "ts":  # Ts: rather an interval
         yield "time", _OF_FIRST + 1
     for phrase, role in VOCABULARY["phrases"].items():

@@ -16,6 +16,7 @@ from bampipe.data.parts import axes_of, join_parts
 from bampipe.data.readers import columns_of, extension_of, is_log, is_text, lerobot, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import read_recording, starts_of
+from bampipe.data.refusals import refusal
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS
 from bampipe.data.session.file import lexically_inside
@@ -223,10 +224,7 @@ class _Logs:
                 wide, first = len(columns) > _MOST_COLUMNS, next(iter(columns))
                 rows = len(self._read_one(name, columns, first)) if small or wide else 2
                 if wide and 0 < 10 * rows < len(columns):
-                    raise InputError(
-                        f"{rows} rows of {len(columns)} columns are no log",
-                        remedy="has it a channel a row? write a sample a row",
-                    )
+                    raise refusal("wide", rows=rows, columns=len(columns))
                 if small and rows < 2:
                     raise InputError("one row of numbers is no log")
                 self.found[name] = columns
@@ -379,13 +377,7 @@ class _Logs:
         other = next((n for n, own in roles.items() if parted and there & own), "")
         if other:
             why = next((f": {reason}" for reason in reasons if other in reason), "")
-            raise InputError(
-                f"positions and drives are in different files, such as {first} and {other}{why}",
-                where=str(self.folder),
-                remedy="put the columns of one recording side by side in one file, the time"
-                " once, and leave the parts out of this folder; or name the parts of each"
-                " recording under [[trials.parts]] of a session.toml",
-            )
+            raise refusal("parted", str(self.folder), first=first, other=other, why=why)
 
     def read(self, trial: TrialEntry, wanted: Sequence[str]) -> tuple[SurveyedColumn, ...]:
         """The columns of one recording."""
@@ -416,11 +408,7 @@ class _Logs:
             here, there = (raw.columns[c][sound] for c in (one, other))
             step = abs(np.nanmedian(np.diff(here))) if len(here) > 1 else 0.0
             if end[one] == end[other] and step and np.nanmax(np.abs(here - there)) > step:
-                raise InputError(
-                    f"columns have times of their own, which differ, as {one} and {other} do",
-                    where=trial.file,
-                    remedy="export all at one rate, or each with its time to a file of its own",
-                )
+                raise refusal("own_times", trial.file, one=one, other=other)
         found = []
         for column in ordered:
             said = raw.units.get(column, labels[column])
@@ -437,16 +425,12 @@ class _Logs:
         nameless = [c for c in found if not c.role and len(np.unique(c.values)) > MOST_IN_TURN]
         moves = [c for c in found if c.role == "position"] or nameless
         for moved in (c for c in moves if take_turns(c.values, keys)):
-            raise InputError(
-                f"{moved.name} is of another axis{'' if moved.role else ' or signal'} in each row",
-                where=trial.file,
-                remedy="write a file for each, such as frame[k::n] or frame.groupby(ID) of pandas,"
-                " or a column for each",
-            )
+            signal = "" if moved.role else " or signal"
+            raise refusal("in_turn", trial.file, column=moved.name, signal=signal)
         return tuple(found)
 
     def recordings(self, trial: TrialEntry) -> list[TrialEntry]:
-        """The recordings that one text file or list of structs holds; others as they are.
+        """The recordings that one file holds; those of bags, and of parts, as they are.
 
         Raises:
             InputError: it cannot be read.
@@ -457,10 +441,11 @@ class _Logs:
         path = self.folder / trial.file
         self.scanned += path.stat().st_size
         columns = self.found[trial.file]
+        times = [c for c, u in columns.items() if role_of(c, u) == "time"]
         several = is_text(trial.file) or any("[:]." in column for column in columns)
+        several |= bool(times) and not times[0].startswith("/")  # of a bag
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
-        times = [c for c, u in columns.items() if role_of(c, u) == "time"]
         column = (times or sorted(columns, key=lambda name: "[:]." not in name))[0]
         moving = [c for c, u in columns.items() if role_of(c, u) == "position"] if times else []
         raw = self._read_one(trial.file, columns, column, *moving)
@@ -469,14 +454,12 @@ class _Logs:
             return [trial]
         wanted = {raw.first_row - 1, *(int(raw.rows[at]) for at in starts)}
         with path.open(encoding="utf-8", errors="replace") as file:
-            lines = [re.split("[,;\t]", x.strip()) for n, x in enumerate(file, 1) if n in wanted]
+            numbered = enumerate(file if is_text(trial.file) else (), 1)
+            lines = [re.split("[,;\t]", x.strip()) for n, x in numbered if n in wanted]
         for name, *axes in zip(*lines, strict=False):
             if {*words(name)} <= _AXES and words(name) and len({*axes}) > 1:
-                raise InputError(
-                    f"recordings of several axes are in turn: {join_names(dict.fromkeys(axes), 4)}",
-                    where=f"{trial.file}, column '{name}'",
-                    remedy="write a file for each, as by frame.groupby of pandas, or a column",
-                )
+                listed, place = join_names(dict.fromkeys(axes), 4), f"{trial.file}, column '{name}'"
+                raise refusal("axes_in_turn", place, axes=listed)
         rows = ", ".join(str(raw.rows[at]) for at in starts[1:4])
         self.remarks.append(
             f"{trial.file} holds {len(starts)} recordings, which begin again at row {rows}"
@@ -532,11 +515,7 @@ def _by_looks(
         if len(unnamed) < len(columns) or not all(numbered):
             return columns, []
         listed = ", ".join(describe(c.name, c.values) for c in columns[:12])
-        raise InputError(
-            "the columns have no names, and none shows itself as a position by its derivative",
-            where=str(folder),
-            remedy=f"name them in order: bampipe init FOLDER --names time,position,...; {listed}",
-        )
+        raise refusal("nameless", str(folder), listed=listed)
     named: dict[str, list[str]] = {}
     for name, role in roles.items():
         named.setdefault("what drives the motion" if role == "force" else role, []).append(name)

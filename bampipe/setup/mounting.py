@@ -98,17 +98,22 @@ def find_mounting(
     def cost(mounting: Mounting) -> float:
         return judge(mounting) + float(_WORTH * mounting.changes)
 
-    best, least = nominal, cost(nominal)
-    for _ in range(_MOST_ROUNDS):
-        tried = [(cost(other), other) for other in _neighbours(best, nominal, turning, stands)]
-        score, other = min(tried, key=lambda one: one[0], default=(np.inf, best))
-        if not score < least and not stands:
-            other = _tilted(best, judge)
-            score = cost(other)
-        if not score < least:
-            break
-        best, least = other, score
-    return best
+    def descend(best: Mounting, stands: bool) -> Mounting:
+        least = cost(best)
+        for _ in range(_MOST_ROUNDS):
+            tried = [(cost(other), other) for other in _neighbours(best, nominal, turning, stands)]
+            score, other = min(tried, key=lambda one: one[0], default=(np.inf, best))
+            if not score < least and not stands:
+                other = _tilted(best, judge)
+                score = cost(other)
+            if not score < least:
+                break
+            best, least = other, score
+        return best
+
+    # Upside down, a robot resembles one of which a joint is reversed.
+    standing = descend(nominal, stands=True)
+    return standing if stands else min(descend(nominal, False), descend(standing, False), key=cost)
 
 
 def _tilted(mounting: Mounting, judge: Judge) -> Mounting:
@@ -123,7 +128,7 @@ def _tilted(mounting: Mounting, judge: Judge) -> Mounting:
         return judge(mounting.under(down + tilt @ aside))
 
     start = _FIRST_TILT * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    options = {"initial_simplex": start, "maxfev": 50, "xatol": 0.01, "fatol": 0.01}
+    options = {"initial_simplex": start, "maxfev": 150, "xatol": 1e-4, "fatol": 1e-4}
     found = minimize(left, start[0], method="Nelder-Mead", options=options)
     tilted = mounting.under(down + found.x @ aside)
     size = float(np.linalg.norm(tilted.gravity) * np.linalg.norm(mounting.gravity))

@@ -1,5 +1,8 @@
 """Text tables as labs write them: the same numbers, or one line that says what to decide."""
 
+import tomllib
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,6 +10,7 @@ from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.readers.trial import Dialect
 from bampipe.errors import InputError
 
+REFUSED = tomllib.loads(Path(__file__).with_name("refused.toml").read_text())
 T = np.arange(40) / 100.0
 X = np.round(np.sin(3 * T), 4)
 N = np.arange(40) - 20
@@ -103,16 +107,7 @@ def test_units_of_names_and_of_the_line_below_are_taken_and_what_was_found_is_sa
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("t;x;n\n1,234;2;3\n1,235;2;3\n", "row 2: '1,234' may be a decimal comma or digits in"),
-        ("t;x;n\n1,5;2.5;3\n1,6;2.6;3\n", "'1,5' in row 2 has a decimal comma, '2.5' in row 2 a"),
-        ("t;x;n\n1,234.5;2;3\n", "row 2, column 't': '1,234.5' groups its digits in thousands"),
-        ("t;x;n\n1.234,5;2;3\n", "'1.234,5' groups its digits in thousands"),
-        ("t,x,n\n0,1,2,5,3\n0,2,2,5,3\n", "row 2: 5 cells, where the header has 3; decimal"),
-        ("t,x,n\n10:00:00,01,2,5\n", "row 2: 4 cells, where the header has 3; the comma in '10:"),
-        ("t;x;n\n10:00:00,01;2;5\n", "found '10:00:00,01', expected a number; is it the time?"),
-        ("t,x,n\n0,1 V,5\n", "row 2, column 'x': found '1 V', expected a number; export numbers"),
-        ("t;x\n0,1;2\n", "row 1: no column 'n'"),
-        ("0;1;2\n1;2;3\n", "no header: the first line holds numbers"),
+        *((it["text"], it["said"]) for it in REFUSED["texts"]),
         (table(";", ",") + "0,41;1.5;3\n0,42;1,5;3\n", "'1.5' in row 42 a point"),
         (table(";") + "0.41;1,5;3\n0.42;1.5;3\n", "'1,5' in row 42 has a decimal comma"),
         (table(" ") + "  0.4  x1  9\n" * 2, "row 42, column 'x': found 'x1', expected a number"),

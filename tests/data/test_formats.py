@@ -121,8 +121,16 @@ def test_fields_of_matlab_structs(tmp_path, compressed):
     assert "did you mean 'log.axis.q'" in refused(path, ("log.time", "log.axis.qq"))
     with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:
         file["log/axis/q"] = Q  # a struct as version 7.3 keeps it
-    trial = read_trial(tmp_path / "b.mat", ("log.axis.q",))
+        texts = (np.array([*map(ord, name)], np.uint16) for name in ("arm [deg]", "u [Nm]"))
+        for key, pair in {"label": texts, "values": (Q, F)}.items():  # and an array of structs
+            held = [file.create_dataset(f"#refs#/{key}{n}", data=x) for n, x in enumerate(pair)]
+            for item in held:
+                item.attrs["MATLAB_class"] = np.bytes_("char" if key == "label" else "double")
+            file[f"log/signals/{key}"] = np.array([[item.ref] for item in held], h5py.ref_dtype)
+    assert columns_of(tmp_path / "b.mat")["log/signals.u Nm"] == "Nm"
+    trial = read_trial(tmp_path / "b.mat", ("log.axis.q", "log/signals.u Nm"))
     np.testing.assert_array_equal(trial.columns["log.axis.q"], Q)
+    np.testing.assert_array_equal(trial.columns["log/signals.u Nm"], F)
     # Gains by axis belong to no sample, and an object of MATLAB has no extents.
     scipy.io.savemat(path, {"q": Q, "tau": F, "scale": 2.0, "gains": np.arange(6.0)})
     body = b"\x06\0\0\0\x08\0\0\0\x11" + bytes(7) + b"\x01\0\x03\0obj\0" + bytes(8)
@@ -185,6 +193,7 @@ def tdms(tmp_path) -> Path:
     nptdms = pytest.importorskip("nptdms")
     path = tmp_path / "a.tdms"
     wave = {"wf_increment": 0.01, "wf_start_offset": 0.0, "unit_string": "N"}
+    slow = wave | {"wf_increment": 0.02}
     start = np.datetime64("2026-10-03T10:12:00", "us")
     with nptdms.TdmsWriter(str(path)) as writer:
         for part in (slice(0, 30), slice(30, None)):
@@ -193,6 +202,7 @@ def tdms(tmp_path) -> Path:
                     nptdms.ChannelObject("Log", "Time", T[part]),
                     nptdms.ChannelObject("Log", "Angle", np.arange(50, dtype=np.int32)[part]),
                     nptdms.ChannelObject("DAQ", "Force", F[part], properties=wave),
+                    nptdms.ChannelObject("DAQ", "Slow", T[part][::2], properties=slow),
                     nptdms.ChannelObject("Log", "When", start + (T * 1e6).astype(int)[part]),
                 ]
             )
@@ -200,11 +210,12 @@ def tdms(tmp_path) -> Path:
 
 
 def test_tdms(tdms):
-    columns = ("Log/Time", "Log/Angle", "DAQ/Force", "DAQ/Force@time")
+    columns = ("Log/Time", "Log/Angle", "DAQ/Force", "DAQ/Force@time", "DAQ/Slow")
     trial = read_trial(tdms, columns)
-    for column, values in zip(columns, (T, np.arange(50), F, T), strict=True):
+    slow = np.append(T[:49], np.nan)  # nothing beyond its last sample
+    for column, values in zip(columns, (T, np.arange(50), F, T, slow), strict=True):
         np.testing.assert_allclose(trial.columns[column], values, atol=1e-12)
-    assert trial.units == {"DAQ/Force": "N", "DAQ/Force@time": "s"}
+    assert trial.units == {"DAQ/Force": "N", "DAQ/Force@time": "s", "DAQ/Slow": "N"}
     found = columns_of(tdms)
     assert set(found) == {*columns, "Log/When"} and found["Log/When"] == "datetime"
     trial = read_trial(tdms, ("Log/When", "Log/Angle"), datetimes={"Log/When": ""})
@@ -486,6 +497,13 @@ def test_units_in_names_and_beside_the_columns_are_heard_in_every_format(tmp_pat
         trial = read_trial(tmp_path / name, ("t [ms]", "q"))
         assert trial.units == {"t [ms]": "ms", "q": "deg"}
         np.testing.assert_array_equal(trial.columns["q"], Q)
+    inner = pa.StructArray.from_arrays([pa.array(np.c_[Q, F].tolist())], ["x"])
+    table = pa.table({"state": pa.StructArray.from_arrays([inner, pa.array(Q)], ["arm", "q"])})
+    for write, name in ((pq.write_table, "k.parquet"), (feather.write_feather, "k.feather")):
+        write(table, tmp_path / name)
+        assert list(columns_of(tmp_path / name)) == ["state.q", "state.arm.x[0]", "state.arm.x[1]"]
+        column = read_trial(tmp_path / name, ["state.arm.x[1]"]).columns["state.arm.x[1]"]
+        np.testing.assert_array_equal(column, F)
 
 
 def test_whole_numbers_are_in_steps_of_the_scale_beside_them(tmp_path):

@@ -501,6 +501,7 @@ def test_units_at_the_end_of_names_and_what_slides(tmp_path):
         proposal = proposed_for(labelled(head), tmp_path / f"d{n}")[1]
         assert "linear axis" in " ".join(proposal.check)
     current = labelled("t,Pos.AngleValue,w,Pos.MotorCurrent")
+    current["volts"] = 3.0 * current["Pos.MotorCurrent"] + 9.0 * current["w"]
     assert "driven by a current" in proposed_for(current, tmp_path / "e")[1].device
     session, _ = proposed_for(labelled("timer,stage pos mm,w,push_gf"), tmp_path / "c")
     assert session["time"]["column"] == "timer" and session["force"]["unit"] == "gf"
@@ -546,6 +547,9 @@ def test_a_load_in_a_register_is_a_duty_cycle_and_no_force(tmp_path, beside: str
     assert drive["wrap_bits"] == 16 and drive["signed"]
     (ask,) = proposal.fill_in
     assert ask.startswith("the scale of duty, 1 over the reading of load at full duty")
+    session, proposal = proposed_for({"torque": table.pop("load"), **table}, tmp_path / "b")
+    (drive,) = (c for c in session["channels"].values() if c["column"] == "torque")
+    assert drive["wrap_bits"] == 16 and "driven by a force" in proposal.device
 
 
 def pendulum(names: str, q: float, u: float) -> dict[str, np.ndarray]:
@@ -575,14 +579,15 @@ def test_sign_bits_of_a_servo_are_taken_off_and_its_counts_shown_by_its_weight(t
 
 @pytest.mark.parametrize(
     ("column", "unit"),
-    [("handle_force_N", "N"), ("loadcell_kN", "kN"), ("kraft", "N"), ("pull_kgf", "kgf")],
+    [("handle_force_N", "N"), ("loadcell_kN", "kN"), ("kraft", "N"), ("pull_gf", "gf")],
 )
 def test_a_force_on_a_joint_needs_a_lever(tmp_path, command: Command, column: str, unit: str):
-    scale = {"kN": 1e-3, "kgf": 1.0 / 9.80665}.get(unit, 1.0)
+    scale = {"kN": 1e-3, "gf": 1e3 / 9.80665}.get(unit, 1.0)
     session, proposal = proposed_for(labelled(f"t,angle_rad,w,{column}", u=scale / 0.31), tmp_path)
     assert (session["force"]["unit"], session["force"]["lever_m"]) == (unit, 0.0)
     (ask,) = proposal.fill_in
     assert ask.startswith("lever_m, how far from the axis") and "measure it" in ask
+    assert tomllib.loads(proposal.device)["parameters"]["inertia"]["lower"] < 0.1 * INERTIA
     code, _, err = command("ingest", tmp_path)
     assert code == 2 and "force.lever_m: found 0, expected the distance in m from the axis" in err
     text = (tmp_path / "session.toml").read_text().replace("lever_m = 0.0", "lever_m = 0.31")
@@ -667,8 +672,10 @@ def test_ticks_of_a_counter_and_slow_logs_are_asked_about(tmp_path):
     for name, scale, time in (
         ("time [0.1 ms]", 1e4, {"unit": "ticks", "ticks_per_s": 1e4}),
         ("time in cycle [ms]", 1e3, {"unit": "ms"}),
+        ("stamp", 1e7, {"unit": "ticks", "ticks_per_s": 1e7}),  # of Windows
     ):
         log = labelled(f"{name},angle_rad,w,torque_nm", t=scale)
+        log[name] += 1.34e17 * (name == "stamp")
         session, proposal = proposed_for(log, tmp_path / f"{scale:g}")
         assert session["time"] == {"column": name, **time} and proposal.fill_in == []
     slow = {n: v[::10] for n, v in labelled("t,q,w,u").items()}
@@ -710,13 +717,18 @@ def test_a_record_of_unknown_rate_is_not_cut_and_lost_rows_are_counted(tmp_path)
     session, proposal = proposed_for(table, tmp_path / "b")
     assert session["time"] == {"column": "sample", "unit": "ticks", "ticks_per_s": 0.0}
     assert "sample numbers the rows, and some are lost" in proposal.fill_in[0]
+    table |= {"sample": table["sample"] % 256.0, "fs": np.full(1580, 200.0)}
+    kept = np.delete(np.arange(500, 1580), [99, 700])
+    session, proposal = proposed_for({n: v[kept] for n, v in table.items()}, tmp_path / "c")
+    assert session["time"]["ticks_per_s"] == 200.0 == session["sample_rate_hz"]
 
 
 def test_what_needs_a_gain_gets_wide_priors(tmp_path):
     t, q, u = machine(5)
-    for name, scale in (("torque_Nm", 1.0), ("torque_percent", 12.5)):
-        proposed_for({"time_s": t, "angle_rad": q, name: scale * u}, tmp_path / name)
-        device = tomllib.loads((tmp_path / name / "device.toml").read_text())
+    named = {"torque_Nm": 1.0, "torque_percent": 9.0, "moment [Nm/kg]": 2.0, "motor_torque_Nm": 3.0}
+    for name, scale in named.items():
+        proposed_for({"time_s": t, "angle_rad": q, name: scale * u}, tmp_path / f"{scale}")
+        device = tomllib.loads((tmp_path / f"{scale}/device.toml").read_text())
         inertia = device["parameters"]["inertia"]
         assert inertia["sd"] == pytest.approx((5, 100)[scale > 1] * inertia["prior"], rel=0.05)
 

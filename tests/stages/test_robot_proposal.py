@@ -35,7 +35,9 @@ URDF = """<?xml version="1.0"?><robot name="arm">
 </joint></robot>"""
 
 
-def write_log(folder: Path, gains: Pair = (1.0, 1.0), swings: Pair = (1.0, 1.0)) -> pd.DataFrame:
+def write_log(
+    folder: Path, gains: Pair = (1.0, 1.0), swings: Pair = (1.0, 1.0), dry: float = 0.8
+) -> pd.DataFrame:
     """A log of both joints at 200 Hz, 20 s; ``gains``: of the logged torque over the joint's."""
     (folder / "arm.urdf").write_text(URDF)
     (folder / "x.toml").write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
@@ -54,7 +56,7 @@ def write_log(folder: Path, gains: Pair = (1.0, 1.0), swings: Pair = (1.0, 1.0))
     )
     p = system.prior
     for axis in ("shoulder", "elbow"):
-        p[system.index(f"viscous.{axis}")], p[system.index(f"coulomb.{axis}")] = 0.5, 0.8
+        p[system.index(f"viscous.{axis}")], p[system.index(f"coulomb.{axis}")] = 0.5, dry
     u = np.zeros((len(t), len(system.inputs)))
     torque = system.required(q, qd, qdd, np.zeros((len(t), 0)), u, p)
     torque = (torque + np.random.default_rng(0).normal(0.0, 0.05, torque.shape)) * gains
@@ -313,14 +315,17 @@ def test_reductions_of_a_device_file_beside_the_logs_are_taken(tmp_path: Path) -
     assert proposal.device == ""
 
 
-@pytest.mark.parametrize("gain", [0.01, pytest.param(1.0, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ("gain", "dry"), [(0.01, 20.0), (0.01, 0.8), pytest.param(1.0, 0.8, marks=pytest.mark.long)]
+)
 def test_many_radians_of_a_motor_are_no_degrees_though_these_stay_in_the_range(
-    tmp_path: Path, gain: float
+    tmp_path: Path, gain: float, dry: float
 ) -> None:
     """A hundred turns read as degrees are 1.7 times the joint's angle; torques are of either."""
-    table = write_log(tmp_path, gains=(gain, gain))
+    table = write_log(tmp_path, (gain, gain), dry=dry)
     table[["q1", "q2"]] *= 100.0
-    table.to_parquet(tmp_path / "log.parquet")
+    ends = {"q1": "q1_rad", "q2": "q2_rad"} if dry > 1.0 else {}
+    table.rename(columns=ends).to_parquet(tmp_path / "log.parquet")
     proposed(tmp_path)
     encoders = read_session(tmp_path).encoders
     assert [encoder.stated_unit for encoder in encoders] == ["rad"] * 2
@@ -340,6 +345,10 @@ def test_a_drive_that_was_not_logged_is_asked_for_and_the_other_stays_where_it_i
     with pytest.raises(InputError, match="fill in the name of the column") as caught:
         read_session(tmp_path)
     assert "channels.torque_shoulder.column" in str(caught.value)
+    (tmp_path / "session.toml").unlink()
+    table = write_log(tmp_path).rename(columns={"tau1": "shoulder_moment", "tau2": names[1]})
+    table.to_parquet(tmp_path / "log.parquet")
+    assert 'torque_shoulder = { column = "shoulder_moment"' in propose(tmp_path).session
 
 
 FINGERS = """<link name="left"/><link name="right"/>
@@ -424,13 +433,17 @@ QUARTER = np.pi / 2.0
         pytest.param(
             {"shoulder": (-1.0, QUARTER)}, [], id="the other way round", marks=pytest.mark.long
         ),
+        pytest.param(
+            {"shoulder": (-1.0, 0.0), "elbow": (1.0, QUARTER)}, ["shoulder"], id="as if hanging"
+        ),
     ],
 )  # fmt: skip
 def test_joints_counted_otherwise_than_drawn(
     tmp_path: Path, counted: dict[str, tuple[float, float]], turned: list[str]
 ) -> None:
     """Six joints; without their zeros half of the drives look turned, and none is."""
-    record_logs(tmp_path / "log", 21, "ZYYXYX", style="joint_states", turned=turned)
+    arm = (7, "ZYY") if set(turned) & set(counted) else (21, "ZYYXYX")
+    record_logs(tmp_path / "log", *arm, style="joint_states", turned=turned)
     table = pd.read_parquet(tmp_path / "log/log_01.parquet")
     for joint, (direction, zero) in counted.items():
         column = f"/joint_states/{joint}/position"

@@ -13,7 +13,7 @@ from bampipe.lists import count_noun
 COARSEST_STAMP = 0.05
 """Share of a step to which time stamps may be rounded: their scatter is a third of it."""
 _PERIODS = (
-    *((f"{n} bits", unit * 2.0**n) for n in (32, 24, 16) for unit in (1.0, 1e-3, 1e-6, 1e-9)),
+    *((f"{n} bits", unit * 2.0**n) for n in (32, 24, 16, 8) for unit in (1.0, 1e-3, 1e-6, 1e-9)),
     *(("midnight", unit * 86_400.0) for unit in (1.0, 1e3, 1e6, 1e9)),
     *(("a full second", unit) for unit in (1.0, 1e3, 1e6, 1e9)),
 )
@@ -51,7 +51,7 @@ def goes_on(values: Array, rows: NDArray[np.intp]) -> bool:
 
 
 def unroll(t: Array) -> tuple[Array, str, NDArray[np.intp]]:
-    """Undo the roll-over of a counter of 16, 24 or 32 bits, of a time of day or of a second.
+    """Undo the roll-over of a counter of 8 to 32 bits, of a time of day or of a second.
 
     Args:
         t: (T,) stamps, in whatever unit.

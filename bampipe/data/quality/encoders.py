@@ -55,19 +55,26 @@ def unwrap(table: TrialTable, encoder: Encoder) -> None:
         return
     turn = 2 * np.pi / abs(encoder.raw_scale) if encoder.unit == "rad" else 0.0
     values = table.columns[encoder.column]
-    found, rows, words = unwrapped(values, turn, encoder.counts)
+    found, rows, words = unwrapped(values, turn, encoder.counts, encoder.zero)
     if len(rows):
         table.columns[encoder.column] = found
+        spans = [float(np.nanmax(x) - np.nanmin(x)) for x in (found, values)]
+        far = encoder.counts and spans[0] > spans[1]
         table.repairs.append(
             f"column '{encoder.column}' wraps {words} {in_times(len(rows))},"
             f" first at row {table.rows[rows[0]]}: unwrapped"
+            + "; a trial begun in another turn of it has another zero"
+            * far
         )
 
 
-def unwrapped(values: Array, turn: float, counts: bool) -> tuple[Array, Indices, str]:
+def unwrapped(
+    values: Array, turn: float, counts: bool, zero: float = 0.0
+) -> tuple[Array, Indices, str]:
     """Readings that go on where they start anew: after full turns, or at the bits of a counter.
 
-    So do motors whose protocol has room for +-12.5 rad, as that of the Mini Cheetah.
+    What fits into one turn is that around ``zero``, as of a register with a sign. Motors whose
+    protocol has room for +-12.5 rad, as that of the Mini Cheetah, start anew, too.
 
     Args:
         values: (T,) raw readings, NaN where missing.
@@ -88,6 +95,9 @@ def unwrapped(values: Array, turn: float, counts: bool) -> tuple[Array, Indices,
         if wraps.any() and near[wraps].all() and np.ptp(values[known]) <= period:
             found = values.copy()
             found[known[1:]] -= period * np.cumsum(np.where(wraps, np.sign(steps), 0.0))
+            low, high = np.nanmin(found), np.nanmax(found)
+            if high - low <= period:
+                found -= period * np.rint((0.5 * (low + high) - zero) / period)
             return found, (known[np.flatnonzero(wraps) + 1]).astype(np.int64), words
     return values, np.empty(0, dtype=np.int64), ""
 

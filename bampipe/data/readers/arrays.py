@@ -31,7 +31,9 @@ _RUN = re.compile(
 )
 """Name of an array of one of several recordings in a file."""
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
-_CLOCK = re.compile(r"(?i)(?:.*[._/])?(?:t|\w*time|\w*stamp)\Z")
+TIME = "@time"
+"""End of the name of the times of a channel that has its own."""
+_CLOCK = re.compile(r"(?i)(?:.*[._/@])?(?:t|\w*time|\w*stamp)\Z")
 _SCALE = re.compile(
     rf"(?i)(?:\A|[ _./])(?:{'|'.join(SCALES[:-1])}|scale_?factor|(offset))\Z|[./]gain\Z"
 )
@@ -273,14 +275,18 @@ def _at_one_rate(arrays: Arrays) -> Arrays:
     groups: dict[str, dict[str, Stored]] = {}
     for name, array in arrays.items():
         owner, dot, key = name.rpartition("/" if "/" in name else ".")
+        if (stem := name.removesuffix(TIME)) + TIME in arrays:  # a channel with times of its own
+            owner, dot, key = stem, "", name.removeprefix(stem)
         sampled = array.kind in _NUMBERS and max(array.shape, default=1) > 1
-        if dot and sampled and not _RUN.fullmatch(name):
+        if owner + dot and sampled and not _RUN.fullmatch(name):
             groups.setdefault(owner + dot, {})[key] = array
     clocks = {
         own: key for own, keys in groups.items() if (key := next(filter(_CLOCK.match, keys), ""))
     }
     kinds = [frozenset(groups[own]) for own in clocks]
-    if len(clocks) < 2 or (len({*kinds}) < len(kinds) and max(map(len, kinds)) > 2):
+    alone = [own.rpartition("/")[2] for own in clocks if own + TIME in arrays]
+    trials = len({*kinds}) < len(kinds) and max(map(len, kinds)) > 2
+    if len(clocks) < 2 or trials or len({*alone}) < len(alone):
         return arrays
     longest = max(
         (groups[own][key] for own, key in clocks.items()), key=lambda x: math.prod(x.shape)

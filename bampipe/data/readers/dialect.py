@@ -16,6 +16,7 @@ from bampipe.data.readers import heads
 from bampipe.data.readers.heads import DELIMITERS, NULLS, Header, Line, cells
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect
+from bampipe.data.refusals import refusal
 from bampipe.data.units import bare, in_steps, unit, units_in
 from bampipe.errors import InputError
 
@@ -77,7 +78,7 @@ class TableLayout:
         count = heads.count_readings(row)
         # The title of a block may hold its number.
         titled = len(self.cells(text)) != len(self.header) and self.is_remark(text)
-        plain = 2 * count < len(row) if titled else not count
+        plain = 2 * count <= len(row) if titled else not count
         wordy = plain and text.expandtabs().isprintable() and any(map(str.isalpha, text))
         return wordy or heads.is_remark(text) or self.ends_in_words(text)
 
@@ -176,28 +177,17 @@ def _decimal(body: list[Line], header: list[str], columns: Sequence[str], delimi
     ]
     for cell, number, column in read:
         if _GROUPED.match(cell):
-            raise InputError(
-                f"'{cell}' groups its digits in thousands",
-                where=f"row {number}, column '{column}'",
-                remedy="export without thousands separators",
-            )
+            raise refusal("thousands", f"row {number}, column '{column}'", cell=cell)
     commas = [each for each in read if "," in each[0] and heads.is_number(each[0], ",")]
     points = [each for each in read if "." in each[0] and heads.is_number(each[0], ".")]
     if not commas or (delimiter == "," and points):
         return "."
     (comma, row, _), *_ = commas
     if points:
-        raise InputError(
-            f"'{comma}' in row {row} has a decimal comma, '{points[0][0]}' in row {points[0][1]} a"
-            " point",
-            remedy='export with one decimal sign, or say decimal = "," or "." under [csv]',
-        )
+        (point, other, _), *_ = points
+        raise refusal("two_decimals", comma=comma, row=row, point=point, other=other)
     if all(_THOUSANDS.match(cell) for cell, _, _ in commas):
-        raise InputError(
-            f"'{comma}' may be a decimal comma or digits in thousands",
-            where=f"row {row}",
-            remedy='say decimal = "," under [csv], or export without thousands separators',
-        )
+        raise refusal("either_decimal", f"row {row}", cell=comma)
     return ","
 
 
@@ -249,7 +239,7 @@ def _units_above(lines: list[Line], header: Header, given: bool) -> dict[str, st
     units |= _units_of_motion([line.text for line in above], names)
     for line in above:
         row = cells(line.text, header.delimiter)
-        if len(row) == len(names) and re.search(r"(?i)\bunits?:?\Z", row[0]):
+        if len(row) == len(names) and re.search(r"(?i)(\b|V)units?:?\Z", row[0]):
             units = {h: u for h, u in zip(names[1:], row[1:], strict=True) if u} | units
     return units
 

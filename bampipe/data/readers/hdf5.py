@@ -4,6 +4,7 @@ A column is the path of a dataset (``log/force``), a field of a compound one (``
 or a column of a matrix (``log/pose[2]``). What lies outside the file is not followed.
 """
 
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -21,9 +22,11 @@ from bampipe.errors import InputError
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 ENDINGS = (".h5", ".hdf5", ".hdf", ".nc")
 """File extensions."""
-_MOST_DATASETS = 2000
+_MOST_DATASETS, _DEEPEST = 2000, 8
 _BLOCK_ROWS = 1 << 14
-_COLUMNS = ("columns", "channels", "names", "column_names", "labels", "fields")
+_COLUMNS = re.compile(
+    r"(?i)(?:(?:column|channel|signal|variable)s?[ _]?)?(?:names|labels)|columns|channels|fields"
+)
 """Attributes with the names of the columns of a matrix."""
 _PACKED = {"scale_factor": 1.0, "add_offset": 0.0}
 """Attributes by which netCDF packs numbers into integers, and their defaults."""
@@ -93,23 +96,30 @@ def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[st
         if not isinstance(group.get(key, getlink=True), h5py.HardLink):
             yield label, None
             continue
-        item = group[key]
-        if isinstance(item, h5py.Dataset):
-            if not item.external and not item.is_virtual:
-                yield label, item
-        elif depth < 8:
-            yield from _datasets(item, f"{label}/", depth + 1)
+        item, inner = group[key], depth + 1
+        held = {label: item}
+        if isinstance(item, h5py.Dataset) and h5py.check_ref_dtype(item.dtype) is h5py.Reference:
+            # Cells, and fields of arrays of structs, as MATLAB keeps them; they may go in circles.
+            own = f"{prefix[:-1]}[{{}}].{key}" if prefix else f"{key}[{{}}]"
+            at = enumerate(item[()].ravel()[:_MOST_DATASETS])
+            held, inner = {own.format(n): group[x] for n, x in at if x}, _DEEPEST
+        for name, within in held.items():
+            if isinstance(within, h5py.Dataset):
+                if not within.external and not within.is_virtual:
+                    yield name, within
+            elif depth < _DEEPEST:
+                yield from _datasets(within, f"{name}/", inner)
 
 
 def _names(data: Any) -> list[str]:
     """Names that the file gives to the columns of a matrix: beside it, or as pandas stores them."""
     items = data.name.removesuffix("_values") + "_items"
     width = min((extent for extent in data.shape if extent != 1), default=0)
-    found = next((data.attrs[key] for key in _COLUMNS if key in data.attrs), ())
+    found = next((data.attrs[key] for key in data.attrs if _COLUMNS.fullmatch(key)), ())
     beside = dict(_datasets(data.parent)).get(items.rpartition("/")[2])
-    if not len(found) and beside is not None and beside.shape == (width,):
+    if not np.size(found) and beside is not None and beside.shape == (width,):
         found = beside[()]
-    texts = _texts(found)
+    texts = _texts(np.ravel(found))
     return texts if data.ndim == 2 and len(texts) == width and len(set(texts)) == width else []
 
 

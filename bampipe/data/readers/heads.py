@@ -5,14 +5,14 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import islice, pairwise, product
 from typing import NamedTuple
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER, Dialect, check_columns
+from bampipe.data.refusals import refusal
 from bampipe.data.units import unit
 from bampipe.data.vocabulary import word_set
-from bampipe.errors import InputError
 
 HEAD = 1 << 16
 TRIED, SEARCHED = 400, 200
@@ -32,6 +32,8 @@ _LISTED = re.compile(
     r"(?i)\W*(?:name|column|channel|signal|ch|col|spalte|kanal)?[ _#]*(\d+)(?:[ _]?name)?\s*[:=)]"
     r"\s*([^\W\d_].*)"
 )
+_FEW_UNITS = 3
+"""Units of a line, of which each has to be known."""
 _ALIKE = 0.97
 """Share of the most numbers in cells that is as good: words above samples may hold a number."""
 
@@ -62,11 +64,7 @@ def split_lines(head: bytes) -> list[Line]:
             text = match[0].decode("utf-8")
         except UnicodeDecodeError as error:
             if number <= 2 and not found:
-                raise InputError(
-                    "the header is not UTF-8 text",
-                    where=f"row {number}",
-                    remedy='save it as UTF-8, or say encoding = "latin-1" under [csv]',
-                ) from error
+                raise refusal("header_encoding", f"row {number}") from error
             text = match[0].decode("utf-8", "replace")
         if text.strip():
             found.append(Line(number, start + match.start(), end, text.rstrip("\r\n")))
@@ -102,8 +100,10 @@ def count_readings(row: Iterable[str]) -> int:
 
 
 def are_units(row: list[str]) -> bool:
-    """Whether every cell is a unit that is known, or stands in brackets."""
-    return any(row) and all(re.match(r"[\[(]", cell) or unit(cell) is not None for cell in row)
+    """Whether every cell is a unit that is known, or stands in brackets; one of many may not."""
+    said = [cell for cell in row if cell]
+    known = sum(bool(re.match(r"[\[(]", cell)) or unit(cell) is not None for cell in said)
+    return bool(said) and known >= len(said) - (len(said) > _FEW_UNITS)
 
 
 def of_properties(row: list[str]) -> tuple[list[str], bool]:
@@ -149,10 +149,12 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
         row = _names(lines[index].text, delimiter, lines[index + 1 :], lines[:index])
         return _fitted(row, lines[index].text, width)
 
-    for index, line in enumerate(lines[:SEARCHED]) if columns else ():
+    # A remark above the header may have a name among its words.
+    searched = enumerate(lines[: SEARCHED * any(columns)])
+    for whole, (index, line) in product((True, False), searched):
         for delimiter in delimiters:
             row = names(index, delimiter)
-            if set(columns) <= set(row):
+            if set(columns) <= set(row) and (not whole or width - 1 <= len(row) <= width):
                 check_columns(row, columns, f"row {line.number}")
                 start, below = find_starts(lines[index + 1 :], delimiters)[0]
                 rows = lines[index + 1 + start :]  # may be separated otherwise than the header
@@ -170,12 +172,8 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
         row = [f"{_NUMBERED}{n}" for n, _ in enumerate(samples, 1)]
         if set(columns) <= set(row):
             return Header(first - 1, mark, row)
-        raise InputError(
-            "no header: the first line holds numbers",
-            where=f"row {lines[0].number}",
-            remedy=f"add a line {','.join(columns)}, or give names under [csv]; without names, the"
-            f" columns are {row[0]} to {row[-1]}",
-        )
+        place, said = f"row {lines[0].number}", ",".join(columns)
+        raise refusal("no_header", place, columns=said, first=row[0], last=row[-1])
     check_columns(row, columns, f"row {lines[index].number}")
     return Header(index, delimiter, row)
 
@@ -240,8 +238,8 @@ def _find_above(lines: list[Line], first: int, delimiter: str) -> int:
         fitting.pop()
     for n in reversed(range(first)):
         row = cells(lines[n].text, delimiter)
-        begun = not sample[0] and re.search(r"(?i)names?:?\Z", row[0])
-        if len(row) == width and (begun or _is_key_of_names(row)):
+        begun = not sample[0] and re.search(r"(?i)(names?:?|waves/?\w?)\Z", row[0])
+        if width - (not sample[-1]) <= len(row) <= width and (begun or _is_key_of_names(row)):
             return n
     wordy = [n for n in fitting if not any(map(POINT.match, rows[n]))]
     if wordy and wordy[-1] != fitting[-1]:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pyarrow import dataset
 
 from bampipe.data.readers.arrays import LARGEST_WIDTH
 from bampipe.errors import InputError
@@ -98,7 +99,9 @@ def _changes(numbers: np.ndarray) -> tuple[int, ...]:
     return tuple(int(at) for at in np.flatnonzero(np.diff(numbers)) + 1)
 
 
-def vector_columns(path: Path, schema: pa.Schema) -> dict[str, tuple[str, int]]:
+def vector_columns(
+    path: Path, schema: pa.Schema, file: dataset.Dataset
+) -> dict[str, tuple[str, int]]:
     """The column and the place in it of every element of vectors of numbers, by its name."""
     features = _features_of(path)
     found = {}
@@ -110,9 +113,9 @@ def vector_columns(path: Path, schema: pa.Schema) -> dict[str, tuple[str, int]]:
             continue
         named = _names(features.get(field.name, {}))
         size = kind.list_size if pa.types.is_fixed_size_list(kind) else len(named)
-        if not size and (first := pq.ParquetFile(path)).metadata.num_rows:
-            batch = next(first.iter_batches(1, columns=[field.name]))
-            size = len(batch.column(0)[0].as_py() or ())
+        if not size:
+            first = file.head(1, columns=[field.name]).column(0).to_pylist()
+            size = len((first or [()])[0] or ())
         names = [f".{name}" for name in named] if len({*named}) == len(named) == size else []
         for place in range(size if size <= LARGEST_WIDTH else 0):  # else a trial in each
             found[field.name + (names[place] if names else f"[{place}]")] = (field.name, place)

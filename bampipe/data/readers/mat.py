@@ -6,6 +6,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +40,19 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         whole = {f"{root}{label}": array for label, array in arrays.items()} if wanted else {}
         yield whole | arrays, ()
     else:
-        with hdf5.opened(path, wanted) as known:
-            yield known
+        with hdf5.opened(path, wanted) as (known, notes):
+            words = {label: array.load() for label, array in known.items() if array.kind == "U"}
+            texts = {
+                x: "".join(map(chr, w.ravel())) for x, w in words.items() if w.dtype.kind == "u"
+            }
+            called = called_signals(known, texts)
+            yield (
+                {
+                    name: replace(known[x], unit=known[x].unit or u)
+                    for x, (name, u) in called.items()
+                },
+                notes,
+            )
 
 
 READER = ArrayReader("variable", _opened)

@@ -37,7 +37,8 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
                 width = array.shape[-1] if array.ndim == 2 else 0
                 called = next((n for n in names if len(n) == width), None)
                 if label == inner and called:
-                    yield from zip(called, array.T, strict=True)
+                    within = f"{path}." if "[" in path else ""  # of a list of recordings
+                    yield from zip((f"{within}{x}" for x in called), array.T, strict=True)
                 else:
                     yield label, array
     elif isinstance(value, list) and value:

@@ -23,6 +23,7 @@ from bampipe.errors import InputError
 _KINDS = {
     "f": (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_boolean),
     "M": (pa.types.is_timestamp,),
+    "m": (pa.types.is_duration,),
     "O": (pa.types.is_date, pa.types.is_string, pa.types.is_large_string),
 }
 """NumPy's kinds of arrays, by the test for the type of a column."""
@@ -37,12 +38,14 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     is_parquet = path.suffix.lower() == ".parquet"
     file = dataset.dataset(path, format=of_parquet if is_parquet else "feather")
     schema, rows = file.schema, file.count_rows()
-    attributes = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}"))
+    while any(pa.types.is_struct(field.type) for field in schema):
+        schema = schema.empty_table().flatten().schema
+    attributes = json.loads((file.schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}"))
     beside = units_beside({k: u for k, u in leaves(attributes) if isinstance(u, str)})
 
     @cache
     def read_column(name: str) -> pa.ChunkedArray:
-        return file.to_table(columns=[name], use_threads=False).column(name)
+        return file.to_table(columns=[name], use_threads=False).column(0)
 
     found = {}
     for field in schema:
@@ -55,8 +58,9 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         sizes = (own.get(key.encode(), b"").decode("utf-8", "replace") for key in SCALES)
         if size := [float(text) for text in sizes if re.fullmatch(NUMBER, text)]:
             said = in_steps(load(), size, said)
+        said, kind = (field.type.unit, "i") if kind == "m" else (said, kind)
         found[field.name] = Stored((rows,), kind, load, said)
-    vectors = lerobot.vector_columns(path, schema)
+    vectors = lerobot.vector_columns(path, schema, file)
     for name, (vector, place) in vectors.items():
         found[name] = Stored((rows,), "f", partial(_cells, read_column, vector, place))
     taken = {vector for vector, _ in vectors.values()}
@@ -102,5 +106,6 @@ def _cells(
             raise InputError(f"a text of {max(lengths)} bytes, expected a date and time")
     elif not any(is_kind(cells.type) for is_kind in _KINDS["O"]):
         cells = cells.cast(pa.uint8()) if pa.types.is_boolean(cells.type) else cells
+        cells = cells.cast(pa.int64()) if pa.types.is_duration(cells.type) else cells
         cells = cells.cast(pa.float64(), safe=False)
     return np.asarray(cells.to_numpy())

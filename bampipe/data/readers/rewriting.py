@@ -18,10 +18,13 @@ from bampipe.data.units import unit
 from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError
 
-_PAIR = re.compile(rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*({NUMBER})(?![\w.:])""")
+_PAIR = re.compile(
+    rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*"""
+    rf"(?:({NUMBER})(?![\w.:])|[\[(]\s*({NUMBER}(?:[,;\s]+{NUMBER})*)\s*[\])])"
+)
 _STAMPED = re.compile(
-    r"\s*\[?((?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d\d:\d\d[.,]\d+)"
-    r"(?:\]|\s*->|\s+(?:DEBUG|INFO|WARN\w*|ERROR)\b)\s*(.*)"
+    r"\s*(?:\[?((?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d\d:\d\d[.,]\d+)"
+    r"(?:\]|\s*->|\s+(?:DEBUG|INFO|WARN\w*|ERROR)\b)|[EWIDV] \((\d+)\) \w+:)\s*(.*)"
 )
 _LINE_PROTOCOL = re.compile(r"[^\s,=]+(?:,\S+)? (\w[^\s=]*=\S+) (\d{10,19})\s*")
 _ELEMENT = re.compile(r"<(\w+)((?:\s+\w+=\"[^\"]*\")+)\s*/?>|<(\w+)>([^<>]*)</")
@@ -73,6 +76,7 @@ def unbroken(text: str) -> str:
 
     Messages as YAML with ``---`` between them, as ROS prints them, become a table.
     """
+    text = text.replace("\f", "")
     messages = re.split(r"(?m)^---\s*$", text)
     lines = messages[0].splitlines() if len(messages) > _FEWEST else []
     if lines and all(map(_OF_MESSAGE.match, lines)):
@@ -127,7 +131,7 @@ def find_form(head: str) -> Form | None:
     for kind, form in _ALIKE.items():
         if _are(kind, lines):
             return form
-    for find in (_protocol_fields, _elements, _PAIR.findall):
+    for find in (_protocol_fields, _elements, _named):
         if pairs := _pairs(lines, find):
             return pairs
     behind = [match[0] for line in lines if (match := _BEHIND.search(line))]
@@ -208,16 +212,16 @@ def _are(kind: re.Pattern[str], lines: Sequence[str]) -> bool:
 
 
 def _stamped(lines: Sequence[str]) -> Form:
-    inner = [match[2] for match in map(_STAMPED.match, lines) if match]
-    pairs = _pairs(inner, _PAIR.findall)
+    inner = [match[3] for match in map(_STAMPED.match, lines) if match]
+    pairs = _pairs(inner, _named)
     sep = "," if pairs else next((d for d in _DELIMITERS if _are(re.compile(f"[{d}]"), inner)), " ")
 
     def rewrite(line: str) -> str:
         match = _STAMPED.match(line)
         if match is None:
             return line
-        rest = pairs.rewrite(match[2]) if pairs else match[2]
-        stamp = match[1].replace(",", ".") if re.search(r"\d", rest) else "time"
+        rest = pairs.rewrite(match[3]) if pairs else match[3]
+        stamp = (match[1] or match[2]).replace(",", ".") if re.search(r"\d", rest) else "time"
         return f"{stamp}{sep}{rest}"
 
     return Form("times stand before each line", rewrite, ("time", *pairs.names) if pairs else ())
@@ -238,6 +242,15 @@ def _elements(line: str) -> list[tuple[str, str]]:
         parts = re.findall(r'(\w+)="([^"]*)"', inner) if inner else [("", content)]
         found += [(f"{name}.{key}" if key else single, value) for key, value in parts]
     return [(name, value) for name, value in found if re.fullmatch(NUMBER, value)]
+
+
+def _named(line: str) -> list[tuple[str, str]]:
+    """Numbers behind their names; those of a list are numbered."""
+    found = []
+    for name, number, listed in _PAIR.findall(line):
+        items = re.split(r"[,;\s]+", listed)
+        found += [(f"{name}[{k}]", x) for k, x in enumerate(items) if x] or [(name, number)]
+    return found
 
 
 def _pairs(lines: Sequence[str], find: Callable[[str], list[tuple[str, str]]]) -> Form | None:

@@ -13,10 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bampipe.data.readers.arrays import ArrayReader, Opened, Stored
+from bampipe.data.readers.arrays import TIME, ArrayReader, Opened, Stored
 from bampipe.data.readers.trial import Wanted, need
-
-TIME = "@time"
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from bampipe.data.readers import moments, rewriting
 from bampipe.data.readers.dialect import TableLayout
 from bampipe.data.readers.heads import HEAD, NULLS, Line
 from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, need, opened
+from bampipe.data.refusals import refusal
 from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError, located
 
@@ -120,12 +121,11 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
             yield stream, dialect, ()
             return
         try:
-            text = stream.read().decode(encoding)
+            # Bytes of a line that broke off, as of a serial port, are no letters.
+            lenient = encoding == "utf-8" and not dialect.encoding
+            text = stream.read().decode(encoding, "replace" if lenient else "strict")
         except UnicodeDecodeError as error:
-            raise InputError(
-                f"not sound {encoding.upper()} text ({error.reason})",
-                remedy="save it as UTF-8, or say another encoding under [csv]",
-            ) from error
+            raise refusal("encoding", encoding=encoding.upper(), reason=error.reason) from error
         taken = "" if dialect.encoding else _TAKEN_AS.get(encoding, "")
         said = (f"not UTF-8: names and units are taken as {taken}",) if taken else ()
         text = rewriting.unbroken(text) if broken else text
@@ -284,21 +284,13 @@ def _read_samples(stream: BinaryIO, layout: TableLayout, end: int, samples: _Sam
                 if samples.passes_over(str(error), line, layout):
                     continue
                 if samples.resumed and line.number - layout.first_line < 5:
-                    raise InputError(
-                        "another table begins",
-                        where=f"row {line.number}",
-                        remedy="save each table as a file of its own",
-                    ) from error
+                    raise refusal("second_table", f"row {line.number}") from error
                 raise _fault(str(error), layout, line) from error
             _read_samples(stream, layout, line.start, samples)
             if again:
                 samples.begun += [samples.rows] if samples.rows else []
             elif len(samples.notes) == _MOST_CHATTER:
-                raise InputError(
-                    f"{_MOST_CHATTER} lines hold text and no sample, and there are more",
-                    where=f"row {line.number}",
-                    remedy="take them out, or log them to another file",
-                ) from error
+                raise refusal("chatter", f"row {line.number}", lines=_MOST_CHATTER) from error
             else:
                 ends = layout.ends_in_words(line.text)
                 what = "ends in words" if ends else "is text and no sample"

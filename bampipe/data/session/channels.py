@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field
 
 from bampipe import schema
 from bampipe.data import units
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError, did_you_mean
 from bampipe.schema import Declaration, Distinct, NamedDeclaration, Number, Several, fault
 
@@ -106,21 +107,13 @@ class Clock(Declaration):
 
     def cross_faults(self) -> Iterator[InputError]:
         if self.unit == "samples" and self.column:
-            yield InputError(
-                'given although unit = "samples" counts them', where="column", remedy="leave it out"
-            )
+            yield refusal("clock_counts")
         if self.unit != "samples" and not self.column:
-            yield InputError(
-                "'column' is missing",
-                remedy='name the time column, or say unit = "samples" where there is none',
-            )
+            yield refusal("clock_lacks")
         if self.format and not self.datetime:
             yield InputError('only for unit = "datetime"', where="format")
         if (self.unit == "ticks") != (self.ticks_per_s is not None):
-            yield InputError(
-                'unit = "ticks" and ticks_per_s belong together',
-                remedy="ticks_per_s is what the counter counts in a second, by its data sheet",
-            )
+            yield refusal("clock_ticks")
         if self.nanoseconds and self.unit not in ("s", "datetime"):
             yield InputError('only for unit = "s" or "datetime"', where="nanoseconds")
 
@@ -208,30 +201,16 @@ class Encoder(NamedDeclaration):
             for key in ("counts_per_unit", "zero_counts", "resolution", "velocity"):
                 field = {"zero_counts": "zero", "resolution": "stated_resolution"}.get(key, key)
                 if field in self.model_fields_set:
-                    yield InputError(
-                        f'given although unit = "{unit}" makes the column a velocity',
-                        where=key,
-                        remedy="leave it out, or give the column of the position",
-                    )
+                    yield refusal("beside_velocity", key, unit=unit)
             return
         if self.velocity is not None:
             found = units.unit(self.velocity.unit)
             if found is None or found.si != f"{self.unit}/s":
-                yield InputError(
-                    f'found "{self.velocity.unit}", expected a unit of velocity such as'
-                    f' "{self.unit}/s"',
-                    where="velocity.unit",
-                )
+                yield refusal("velocity_unit", found=self.velocity.unit, unit=self.unit)
         if self.counts_per_unit is None:
             return
         if not 1e-6 < abs(self.counts_per_unit) < 1e15:
-            yield InputError(
-                f"found {self.counts_per_unit:g}, expected the number of counts in one {unit},"
-                " not zero",
-                where="counts_per_unit",
-                remedy="negative turns the axis round; leave the key out for a column already in"
-                " units",
-            )
+            yield refusal("counts", found=self.counts_per_unit, unit=unit)
         if self.stated_resolution is not None:
             yield InputError("given beside counts_per_unit, which sets it", where="resolution")
 
@@ -312,39 +291,21 @@ class Force(Declaration):
     def cross_faults(self) -> Iterator[InputError]:
         components, columns = self.components, len(self.columns)
         if len(components) != columns and not (self.volts and len(components) < columns):
-            yield InputError(
-                f"found {len(components)} names, expected {columns}, one a column",
-                where="components",
-                remedy=""
-                if self.volts
-                else 'several columns make one component only where unit = "V"',
-            )
+            name = "components" if self.volts else "components_joined"
+            yield refusal(name, found=len(components), columns=columns)
         for component, times in Counter(components).items():
             if times > 1 or not component.isidentifier():
-                yield InputError(
-                    f"the columns give no clear name to component '{component}'",
-                    where="columns",
-                    remedy='name the components: components = ["x", ...]',
-                )
+                yield refusal("component_name", component=component)
         if self.lever is not None and self._calibrated_unit != "N":
             yield InputError(f'unit = "{self.raw_unit}" is a torque already', where="lever_m")
         if self.lever == 0.0:
-            yield InputError(
-                "found 0, expected the distance in m from the axis at which the force acts",
-                where="lever_m",
-                remedy='measure it; of a column that is a torque already, unit = "N.m" and no'
-                " lever_m",
-            )
+            yield refusal("no_lever")
         for key in ("calibration_n_per_v", "zero_v"):
             given = getattr(self, key) is not None
             if self.volts and not given:
                 yield InputError(f"'{key}' is missing", remedy='it is needed where unit = "V"')
             if not self.volts and given:
-                yield InputError(
-                    f'given although unit = "{self.raw_unit}" needs no calibration',
-                    where=key,
-                    remedy='give unit = "V" or leave it out',
-                )
+                yield refusal("no_calibration", key, unit=self.raw_unit)
         if self.volts and self.zero_v is not None and len(self.zero_v) != columns:
             yield InputError(
                 f"found {len(self.zero_v)}, expected {columns}, one a column", where="zero_v"
@@ -353,17 +314,11 @@ class Force(Declaration):
             rows = self.calibration_n_per_v
             lengths = sorted({len(row) for row in rows})
             if len(rows) != len(components) or lengths != [columns]:
-                yield InputError(
-                    f"found {len(rows)} rows of {' and '.join(map(str, lengths))} numbers,"
-                    f" expected {len(components)} rows of {columns}, for {columns} columns",
-                    where="calibration_n_per_v",
-                )
+                found = f"{len(rows)} rows of {' and '.join(map(str, lengths))} numbers"
+                expected = f"{len(components)} rows of {columns}"
+                yield refusal("calibration_rows", found=found, expected=expected, columns=columns)
             elif not np.linalg.cond(np.array(rows)) < LARGEST_CONDITION:
-                yield InputError(
-                    "the matrix is singular: some force gives no voltage",
-                    where="calibration_n_per_v",
-                    remedy="no row is zero, none like another: fill in what a known force reads",
-                )
+                yield refusal("singular")
 
 
 class Brake(NamedTuple):
@@ -391,20 +346,14 @@ class BrakeTable(Declaration):
         if not set(named) <= set(axes):
             unknown = next(name for name in named if name not in axes)
             if len(self.columns) != len(axes) or any(name in axes for name in named):
-                raise InputError(
-                    f"column 'brake_{unknown}' names no axis{did_you_mean(unknown, axes)}",
-                    where="brakes.columns",
-                    remedy=f"call it brake_<axis>; the axes are {', '.join(axes)}",
-                )
+                near = did_you_mean(unknown, axes)
+                raise refusal("brake_axis", name=unknown, near=near, axes=", ".join(axes))
             named = list(axes)
         stated = [unit.strip() for unit in self.unit.split(",")]
         if len(stated) == 1:
             stated *= len(self.columns)
         if len(stated) != len(self.columns):
-            raise InputError(
-                f"found {len(stated)} units, expected {len(self.columns)}, one a column",
-                where="brakes.unit",
-            )
+            raise refusal("brake_units", found=len(stated), columns=len(self.columns))
         for axis, unit in zip(named, stated, strict=True):
             expected = "N.m" if axes[axis].unit == "rad" else "N"
             if unit != expected:

@@ -14,6 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, String
 
 from bampipe import schema
 from bampipe.data.readers.trial import Dialect
+from bampipe.data.refusals import refusal
 from bampipe.data.session.channels import (
     LARGEST_CONDITION,
     SECONDS,
@@ -67,11 +68,7 @@ def inside(root: Path, path: str, where: str) -> Path:
     except (OSError, ValueError) as error:
         raise InputError(f"path '{path}' cannot be used", where=where) from error
     if exists and not is_inside(Path(root), PurePosixPath(path).as_posix()):
-        raise InputError(
-            f"'{path}' is a link to a place outside the session folder",
-            where=where,
-            remedy="copy the file into the session folder",
-        )
+        raise refusal("link_outside", where, path=path)
     if not exists:
         stem = full.stem.lower()
         near = [other for other in full.parent.glob("*") if other.stem.lower() == stem != ""]
@@ -169,18 +166,14 @@ class TrialEntry(NamedDeclaration):
             if value is None and self.kind == only:
                 yield InputError(f"'{key}' is missing", remedy=f'needed for a "{only}" trial')
             if value is not None and self.kind != only:
-                yield InputError(
-                    f'given for a "{self.kind}" trial', where=key, remedy=f'only for "{only}"'
-                )
+                yield refusal("other_kind", key, kind=self.kind, only=only)
         named = Counter(part.name for part in self.parts)
         named.update([self.part] if self.part else [])
         for name, times in named.items():
             if times > 1:
                 yield InputError(f"{times} parts are called '{name}'", where="parts")
         if not self.start_s < self.end_s:
-            yield InputError(
-                f"found {self.end_s:g}, expected more than start_s, {self.start_s:g}", where="end_s"
-            )
+            yield refusal("end", end=self.end_s, start=self.start_s)
 
 
 def _with_ids(trials: tuple[TrialEntry, ...]) -> tuple[TrialEntry, ...]:
@@ -317,11 +310,7 @@ class Session(Declaration):
         for channel in self.channels:
             name = channel.name
             if name in ("trial_id", "t") or name.startswith(("q_", "force_", "brake_")):
-                yield InputError(
-                    f"the name '{name}' is taken by ingest's own columns",
-                    where="channels",
-                    remedy="choose another name, or use [encoders], [force] or [brakes]",
-                )
+                yield refusal("name_taken", name=name)
         try:
             columns = self.columns
         except InputError as error:
@@ -338,17 +327,13 @@ class Session(Declaration):
             if axis and axis not in axes:
                 yield _no_axis(axis, axes, f"channels.{channel.name}.second_encoder_of")
             elif axis and channel.unit != units[axis]:
-                yield InputError(
-                    f"a unit of {channel.unit or 'a pure number'}, expected one of {units[axis]}",
-                    where=f"channels.{channel.name}.unit",
-                    remedy=f"that is the unit of {axis}; give the scale that leads to it",
+                found, place = channel.unit or "a pure number", f"channels.{channel.name}.unit"
+                yield refusal(
+                    "second_encoder_unit", place, unit=found, expected=units[axis], axis=axis
                 )
         for column, times in Counter(columns).items():
             if times > 1:
-                yield InputError(
-                    f"column '{column}' is used for {times} channels",
-                    remedy="each channel has its own column",
-                )
+                yield refusal("column_twice", column=column, times=times)
         yield from self._faults_of_trials()
 
     def _faults_of_trials(self) -> Iterator[InputError]:
@@ -362,19 +347,10 @@ class Session(Declaration):
                 stretches = {(t.start_s, t.end_s) for t in (trial, other)}
                 twice = stretches == {(0.0, math.inf)}
                 if other.file == trial.file and other.overlaps(trial) and not twice:
-                    yield InputError(
-                        f"overlaps trial {other.name} of the same file",
-                        where=place,
-                        remedy="give each stretch its own start_s and end_s: held-out samples"
-                        " must not be in another trial",
-                    )
+                    yield refusal("overlap", place, other=other.name)
         free = [trial for trial in self.trials if trial.kind == "free"]
         if any(trial.hold_out for trial in self.trials) and all(t.hold_out for t in free):
-            yield InputError(
-                "every free trial is held out: nothing is left to identify from",
-                where="trials",
-                remedy="leave hold_out away from some",
-            )
+            yield refusal("all_held_out")
 
 
 def read_session(path: Path) -> Session:
@@ -388,9 +364,7 @@ def read_session(path: Path) -> Session:
     if not path.exists():
         raise InputError("no such session folder", where=str(path))
     if not file.is_file():
-        raise InputError(
-            f"no {FILE_NAME} in this folder", where=str(path), remedy="give a session folder"
-        )
+        raise refusal("no_session", str(path), name=FILE_NAME)
     return session_from(read_toml(file), file.parent, str(file))
 
 

@@ -149,12 +149,16 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> 
     sizes = [abs(drive.share) for drive in columns.drives.values()]
     if not robot.motors:
         scale_sd |= dict.fromkeys(columns.gears, _GUESSED_GEAR)
-    if not chosen.text or not all(drive.is_sure for drive in columns.drives.values()) or not sizes:
+    sure = [drive.is_sure for drive in columns.drives.values()]
+    # The motors behind gears are alike: those of upright axes, too, whose drives tell little.
+    if not chosen.text or not any(sure) or not (all(sure) or columns.gears):
         return chosen
     joints = [c.name for c in chosen.device.coordinates]
     turns = [columns.gears.get(joint, 1.0) for joint in joints]
     of_motor = [size * ratio for size, ratio in zip(sizes, turns, strict=True)]
     if chosen.device.force_unit == "A":
+        if not all(sure):
+            return chosen
         found = zip(joints, turns, of_motor, strict=True)
         guessed = {j: (n, 1.0 / size) for j, n, size in found}
         # On the joint that carries most, errors of single bodies count least.
@@ -165,7 +169,8 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> 
         reference = max(size, key=lambda name: size[name])
         scale_sd[reference] = f", scale_sd = {robot.uncertainty}"
         return with_motors(folder, chosen, guessed, reference.removeprefix("current_"))
-    if columns.gears and all(STATED[0] < size < STATED[1] for size in of_motor):
+    told = [size for size, tells in zip(of_motor, sure, strict=True) if tells]
+    if columns.gears and all(STATED[0] < size < STATED[1] for size in told):
         scale_sd |= dict.fromkeys(columns.drives, _GUESSED_GEAR)
         return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
     if not columns.gears and all(size < STATED[0] for size in sizes):

@@ -211,12 +211,12 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
         turned = replace(driver, values=-driver.values)
         fit = _rough_fit(position, turned, role, linear, match.t)
         notes.check.append(sentence("reaction", column=driver.name))
-    drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
+    name = driver.name if driver is not None else ""
+    drive = Drive(role, name, supply is not None, coil, register=name in match.registers)
     if driver is not None:
-        levered = (
-            driver.si == "V" or needs_gain(driver) or (not linear and positions.is_force(driver))
-        )
-        drive = replace(drive, scaled=role == "force" and not levered)
+        levered = not linear and (positions.is_force(driver) or "motor" in words(driver.name))
+        asked = driver.si == "V" or needs_gain(driver) or driver.is_foreign or driver.by_looks
+        drive = replace(drive, scaled=role == "force" and not (asked or levered))
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     springs = fit.pose is not None and fit.pose.reading == "spring"
     match.geared = position.name if springs and _may_be_geared(position) else ""

@@ -59,7 +59,16 @@ def pair_joints(
     if not drives and positions:
         incomplete = [g for r in roles for g in _incomplete(motors, found.of(r), positions[0])]
         most = max(incomplete, key=len, default={})
+        # The force of a joint that slides may be called otherwise.
+        for motor in (m for m in motors if most and m not in most):
+            own = [c for c in found.of(*roles) if c not in most.values()]
+            named = [
+                c for c in own if _without(_tokens(c.name, c.unit), _tokens(motor)) is not None
+            ]
+            most = {**most, motor: named[0]} if len(named) == 1 else most
         some = {name: most[m] for name, m in zip(device.forces, motors, strict=True) if m in most}
+        if len(some) == len(motors):
+            return positions, [Group(tuple(some.values()), named=True)], {}
     return positions, drives, some
 
 

@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.guesses import is_time
 from bampipe.data.names import DRIVERS, REFERENCE_WORDS, words
 from bampipe.data.session import Register
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.setup.proposal.notes import Notes
-from bampipe.setup.proposal.positions import is_of_motor, travelled
+from bampipe.setup.proposal.positions import TORQUES, is_of_motor, travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
 _NO_LESS = 0.03
@@ -178,9 +179,10 @@ class Matcher:
         named = [c for role in DRIVERS for c in self.found.of(role) if not c.is_constant]
         best = self.driving(position) or next(iter(named), None)
         if best is not None and not best.unit and best.name in self.registers:
-            # The load of a servo is the share of the time that its bridge is on: no force comes as
-            # a register, and a current is called one.
-            return best, "current" if best.role == "current" else "duty"
+            # The load of a servo is the share of the time that its bridge is on; a current or a
+            # torque is called one.
+            is_torque = not TORQUES.isdisjoint(words(best.name))
+            return best, "force" if is_torque else "current" if best.role == "current" else "duty"
         if best is None or best.role not in DRIVERS:
             return best, "force"
         duty = best.role == "voltage" and {"pwm", "duty"} & set(words(best.name))
@@ -197,11 +199,13 @@ class Matcher:
         """The column that acceleration, velocity and friction of the motion explain best."""
         share = {}
         # The command of a coil brakes the motion, and follows it if a force is controlled.
-        asked = REFERENCE_WORDS if self.found.of("force") else frozenset[str]()
+        forced = any(not REFERENCE_WORDS & set(words(c.name)) for c in self.found.of("force"))
+        asked = REFERENCE_WORDS if forced else frozenset[str]()
         for column in self.found.columns:
             known = column.name in self.used or column.role in _NEVER_DRIVES
             of_axis = column is position or column.si in ("rad", "m")
-            known |= column.is_integer and np.ptp(column.values) == 1.0  # a flag
+            # A flag, or the number of the row.
+            known |= column.is_integer and (np.ptp(column.values) == 1.0 or is_time(column.values))
             if known or column.is_constant or of_axis or asked & set(words(column.name)):
                 continue
             share[column.name] = self._share(position, column)
@@ -213,6 +217,7 @@ class Matcher:
         for is_likelier in (
             lambda name: roles[name] in DRIVERS,
             lambda name: not _SUPPLIED & set(words(name)),
+            lambda name: roles[name] != "voltage",  # which goes with the speed, too
             lambda name: number and _numbers(name) == number,
             lambda name: at_motor or "motor" not in words(name) or roles[name] != "force",
         ):

@@ -17,7 +17,7 @@ from bampipe.data.vocabulary import word_set
 from bampipe.setup.proposal.notes import Notes
 
 SLIDING, TURNING, _SHARES = map(word_set, ("sliding", "turning", "shares"))
-_FORCES, _TORQUES = map(word_set, ("forces", "torques"))
+_FORCES, TORQUES = map(word_set, ("forces", "torques"))
 _FEWEST_COUNTS = 100
 _MOST_WILD = 0.01
 """Largest share of the readings that may be wild or missing."""
@@ -44,7 +44,7 @@ def is_force(column: SurveyedColumn) -> bool:
     said = set(words(column.name))
     if column.si is not None:
         return column.si in ("N", "kg")
-    return bool(said & _FORCES) and not said & _TORQUES
+    return bool(said & _FORCES) and not said & TORQUES
 
 
 def needs_gain(column: SurveyedColumn) -> bool:
@@ -80,7 +80,7 @@ def position_in_si(column: SurveyedColumn, t: np.ndarray, si: str) -> np.ndarray
 
 def scale_to(si: str, column: SurveyedColumn) -> float:
     """What brings the values of a column to ``si``, by its unit or by the likely one."""
-    if column.si == si:
+    if column.si == si or (column.si, si) == ("N", "N.m"):  # the lever is to be asked for
         return column.scale
     known = unit(guesses.likely_unit(si, column.values) or si)
     return known.scale if known is not None else 1.0

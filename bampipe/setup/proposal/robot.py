@@ -240,8 +240,10 @@ def find_robot_columns(
         positions, best = other_unit, other
         notes.check.append(sentence("degrees", put_in=sentence("put_in")))
     left, sound = mean_left(best.drives), drawn_bodies.fits(best.drives)
-    beyond = _beyond_range(logged, positions, of_joint=sound)
-    guessed = positions is not stated and left > _DOUBTED
+    # Friction and the inertia of drives explain much of any motion.
+    shown = sound and any(drive.is_sure for drive in best.drives)
+    beyond = _beyond_range(logged, positions, of_joint=shown)
+    guessed = (positions is not stated and left > _DOUBTED) or bool(beyond and not shown)
     on_motors = bool(beyond) if known else guessed and not robot.motors
     geared: list[tuple[Group, Gears]] = []
     # Hundreds without a unit are degrees, or radians of a motor.

@@ -54,6 +54,7 @@ class Drive:
         supply: whether the supply voltage that a duty cycle is a share of is recorded too.
         coil: whether, beside a force, the current of a coil that changes the friction is.
         scaled: whether what is recorded is a force or torque at the axis, no gain or lever missing.
+        register: whether it is a register with a sign, as a channel may be.
     """
 
     role: str
@@ -61,6 +62,7 @@ class Drive:
     supply: bool = False
     coil: bool = False
     scaled: bool = True
+    register: bool = False
 
 
 def weight_of(
@@ -150,7 +152,7 @@ def starter_device(
         drive=sentence(driven) if motor or drive.coil else "", rate=rate, torque=torque,
         scaled=listed and sentence("scaled", constants=listed), viscous=viscous, coulomb=coulomb,
     )  # fmt: skip
-    least, spread = _least_inertia(linear, drive.coil, found), 0.6 * wide * abs(found.coulomb)
+    least, spread = _least_inertia(linear, drive.coil, found, wide), 0.6 * wide * abs(found.coulomb)
     inertia = (*_prior(found.inertia, wide), f"lower = {rounded(least)}")
     offset = ("prior = 0.0", f"sd = {rounded(spread or 20.0)}")
     text += _parameter(f"inertia{end}", mass, inertia, "all that moves, reduced to this axis")
@@ -185,7 +187,7 @@ def _input_of(
         applied = f"torque_constant/resistance*(duty*supply - torque_constant*qd_{axis})"
         applied = "force_at_full*duty" if linear else applied
         return "duty", "", applied, {name: sentence(name) for name in names}
-    source = f"force{end or '_drive'}"
+    source = f"drive{end}" if drive.register else f"force{end or '_drive'}"
     return source, torque, source, {}
 
 
@@ -222,10 +224,10 @@ def _potential(axis: str, linear: bool, weight: Weight | None, end: str) -> str:
     return sentence("weight", axis=axis, doubt=weight.doubt or "the motion shows it")
 
 
-def _least_inertia(linear: bool, coil: bool, found: Driven) -> float:
+def _least_inertia(linear: bool, coil: bool, found: Driven, wide: float) -> float:
     # A mass near zero under friction is a motion that no simulation can follow. Where force is
     # nearly all friction the guess of the mass is not worth much: friction has the last word.
-    least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if linear else 1e-5
+    least = 0.5 / wide**2 * found.inertia if found.inertia > 0.0 else 0.1 if linear else 1e-5
     least = min(least, _FASTEST_S * found.viscous) if found.viscous > 0.0 else least
     heavy = 0.3 * min(found.inertia, 1.0) if found.inertia > 0.0 else 0.3
     return max(least, heavy) if coil and linear else least

@@ -31,6 +31,11 @@ _COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timestep
 """Words in the name of a clock that counts at a rate of its own."""
 _FRACTIONS = {"ns": 1e9, "us": 1e6, "ms": 1e3}
 """Units of the fraction beside whole seconds, and how many make one second."""
+_OF_WINDOWS = (
+    (1.2e17, 1.6e17, "100 ns, as Windows counts them since 1601"),
+    (6.2e17, 6.6e17, "100 ns, as .NET counts them since the year 1"),
+)
+"""Least and largest stamp of today, and what it counts."""
 _MIXED = 0.1
 """Share of steps at which times fall that are all different, of rows that stand out of order."""
 _SLOW_HZ = 40.0
@@ -102,9 +107,11 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     kind = "" if counter else guesses.time_unit(stamps + start, column.unit or named_unit)
     written = f"{column.name} {column.unit}"
     tick = re.search(r"(?<![\d.])(\d*\.?\d+) ?_?(ns|us|ms)(?![A-Za-z])", written)
-    if tick and (counter or (column.si == "s" and not plain)):
-        size = float(tick[1]) * SECONDS[tick[2]]
-        note = notes.guess(f"a count of {column.name} is {tick[0]}, by its name")
+    since = next((why for low, high, why in _OF_WINDOWS if low < start < high), "")
+    if since or (tick and (counter or (column.si == "s" and not plain))):
+        size = float(tick[1]) * SECONDS[tick[2]] if tick and not since else 1e-7
+        why = since or f"{tick and tick[0]}, by its name"
+        note = notes.guess(f"a count of {column.name} is {why}")
         lines = [named, 'unit = "ticks"', f"ticks_per_s = {1.0 / size:.10g}{note}"]
         t = stamps * size
         return ProposedClock(t, (column.name,), lines, _stamped_rate(t, notes))
@@ -154,18 +161,21 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
     steps = {name: step for name, step in steps.items() if step > 0.0}
     steps |= {name: step for name, step in found.intervals.items() if name not in steps}
     rates = {name: float(f"{1.0 / step:.6g}") for name, step in steps.items()}
-    if len(set(rates.values())) == 1:
-        name, rate_hz = next(iter(rates.items()))
+    name, rate_hz = next(iter(rates.items())) if len({*rates.values()}) == 1 else ("", 0.0)
+    numbers = next((c for c in found.columns if not c.role and _numbers_rows(c)), None)
+    if numbers is not None:
+        why = f"{numbers.name} numbers the rows, some of which are lost, and {name} sets the rate"
+        note = notes.guess(why) if name else notes.ask("row_numbers", clock=numbers.name)
+        lines = [f"column = {quoted(numbers.name)}", 'unit = "ticks"']
+        lines += [f"ticks_per_s = {rate_hz:g}{note}"]
+        rate = f"sample_rate_hz = {rate_hz:g}" if name else UNKNOWN_RATE
+        t = unroll(numbers.values - numbers.values[0])[0] / (rate_hz or _LIKELY_RATE_HZ)
+        return ProposedClock(t, (numbers.name,), lines, rate)
+    if name:
         note = notes.guess(f"samples are counted, and {name} sets the rate")
         taken = tuple(n for n in rates if n in constants)
         counted = (f'unit = "samples"{note}',)
         return ProposedClock(samples / rate_hz, taken, counted, f"sample_rate_hz = {rate_hz:g}")
-    numbers = next((c for c in found.columns if not c.role and _numbers_rows(c)), None)
-    if numbers is not None:
-        note = notes.ask("row_numbers", clock=numbers.name)
-        lines = f"column = {quoted(numbers.name)}", 'unit = "ticks"', f"ticks_per_s = 0.0{note}"
-        t = (numbers.values - numbers.values[0]) / _LIKELY_RATE_HZ
-        return ProposedClock(t, (numbers.name,), lines)
     stamps = next((column for column in found.of("time") if not column.is_constant), None)
     why = "no column increases like a time"
     if stamps is not None:
@@ -193,7 +203,7 @@ def _counts_on(column: SurveyedColumn) -> bool:
 
 def _numbers_rows(column: SurveyedColumn) -> bool:
     """Whether a column counts rows, some of which are lost."""
-    steps = np.diff(column.values) if column.is_integer else np.zeros(1)
+    steps = np.diff(unroll(column.values)[0]) if column.is_integer else np.zeros(1)
     return bool(np.min(steps, initial=1.0) >= 1.0 and np.median(steps) == 1.0 < np.max(steps))
 
 
