@@ -7,6 +7,7 @@ import numpy as np
 from scipy.stats import gamma
 
 from bampipe.arrays import Array
+from bampipe.diagnosis.session import bounds_of
 from bampipe.diagnosis.shape import (
     BINS,
     Variable,
@@ -108,13 +109,20 @@ def _by_trial(linearisation: Linearisation, axis: int) -> tuple[float, str]:
         columns, row = slopes[:, axis][:, own], names.index(trial)
         moment[row] += columns.T @ left[:, axis]
         square[row] += np.sum(columns**2, axis=0)
-    taken = np.sum(moment**2 / np.maximum(square, 1e-300), axis=0)
-    taken -= moment.sum(axis=0) ** 2 / np.maximum(square.sum(axis=0), 1e-300)
+    p, low, high = (x[[e.free[k] for k in own]] for x in (e.p, *bounds_of(e.system)))
+
+    def change(moment: Array, square: Array) -> tuple[Array, Array]:
+        """Return the best values within their bounds, and the fall of the sum of squares."""
+        step = np.clip(p - moment / np.maximum(square, 1e-300), low, high) - p
+        return p + step, -(2.0 * moment + step * square) * step
+
+    values, falls = change(moment, square)
+    taken, alike = falls.sum(axis=0), change(moment.sum(axis=0), square.sum(axis=0))[1]
+    taken[taken < 2.0 * alike] = 0.0  # one other value for all trials does most of it
     best = int(np.argmax(taken))
-    number = e.free[own[best]]
-    parameter = e.system.parameters[number]
+    parameter = e.system.parameters[e.free[own[best]]]
     known = square[:, best] >= _SEEN * square[:, best].max()
-    values = e.p[number] - moment[known, best] / np.maximum(square[known, best], 1e-300)
+    values = values[known, best]
     total = sum(float(left[:, axis] @ left[:, axis]) for left in e.residual)
     ends = (
         f"{significant(values[k], 2)} {parameter.unit}".strip() + f" in {np.array(names)[known][k]}"
