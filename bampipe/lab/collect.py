@@ -32,14 +32,11 @@ class Lab:
     skipped: tuple[str, ...]
 
 
-def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress = silent) -> Lab:
+def collect(runs: Path, folder: Path, progress: Progress = silent) -> Lab:
     """Read every run in ``runs`` and write the lab's folder anew.
 
     A run that cannot be read is left out and named. Every file is replaced whole; ``lab.json``
     comes last.
-
-    Args:
-        report: whether to write report.pdf and report.html too.
 
     Raises:
         InputError: there is no run in ``runs``, or a file cannot be written.
@@ -70,23 +67,22 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
     with hold(folder, LOCK):  # simultaneous collections take turns
         counts = lab_tables.write(folder, tables)
         content.write(folder)
-        if report:
-            progress(0.7, "report")
-            # matplotlib is slow to import: only here
-            from bampipe.report.lab_report import build_lab_report
+        progress(0.7, "report")
+        # matplotlib is slow to import: only here
+        from bampipe.report.lab_report import build_lab_report
 
-            # The folders of the sessions' reports, relative to the lab's.
-            reports = {root.name: root.resolve() / "report" for root in roots}
-            pages = {
-                name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
-                for name, report in reports.items()
-                if (report / "explore.html").is_file()
-            }
-            made = build_lab_report(folder, pages)
-            made.write(folder)
-            for old in (folder / "figures").glob("*.svg"):
-                if old.stem not in made.figures:
-                    old.unlink()
+        # The folders of the sessions' reports, relative to the lab's.
+        reports = {root.name: root.resolve() / "report" for root in roots}
+        pages = {
+            name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
+            for name, report in reports.items()
+            if (report / "explore.html").is_file()
+        }
+        made = build_lab_report(folder, pages)
+        made.write(folder)
+        for old in (folder / "figures").glob("*.svg"):
+            if old.stem not in made.figures:
+                old.unlink()
         sessions = tuple(str(one.key["session_id"]) for one in found)
         LabResult(
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
