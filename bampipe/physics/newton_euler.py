@@ -43,7 +43,7 @@ class Link:
     slides: bool
     axis: Vector
     position: Vector
-    rotation: tuple[Vector, Vector, Vector]
+    rotation: tuple[Vector, ...]
     follows: int = -1
     ratio: float = 1.0
     zero: float = 0.0
