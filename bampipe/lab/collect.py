@@ -1,7 +1,6 @@
 """Collect the runs of a lab: tables, trends and a report, from all stages that have run."""
 
 import os
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
@@ -18,25 +17,13 @@ from bampipe.run.lock import hold
 _EARLIEST = datetime.min.replace(tzinfo=UTC)
 
 
-@dataclass(frozen=True)
-class Lab:
-    """A lab's folder, and its content.
-
-    Attributes:
-        content: of ``trends.json``.
-        skipped: one line on each run folder that could not be read.
-    """
-
-    folder: Path
-    content: TrendsResult
-    skipped: tuple[str, ...]
-
-
-def collect(runs: Path, folder: Path, progress: Progress = silent) -> Lab:
+def collect(
+    runs: Path, folder: Path, progress: Progress = silent
+) -> tuple[TrendsResult, LabResult]:
     """Read every run in ``runs`` and write the lab's folder anew.
 
     A run that cannot be read is left out and named. Every file is replaced whole; ``lab.json``
-    comes last.
+    comes last. Returns the content of ``trends.json`` and of ``lab.json``.
 
     Raises:
         InputError: there is no run in ``runs``, or a file cannot be written.
@@ -84,7 +71,8 @@ def collect(runs: Path, folder: Path, progress: Progress = silent) -> Lab:
             if old.stem not in made.figures:
                 old.unlink()
         sessions = tuple(str(one.key["session_id"]) for one in found)
-        LabResult(
+        lab = LabResult(
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
-        ).write(folder)
-    return Lab(folder, content, tuple(skipped))
+        )
+        lab.write(folder)
+    return content, lab

@@ -65,8 +65,8 @@ DRIFTED = made(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
 
 
 def verdicts(runs: Path) -> dict[str, dict[str, object]]:
-    found = collect(runs, runs.parent / "lab")
-    return {one["session"]: one for one in found.content.model_dump()["sessions"]}
+    found, _ = collect(runs, runs.parent / "lab")
+    return {one["session"]: one for one in found.model_dump()["sessions"]}
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,8 @@ def test_its_json_files_are_as_their_schemas_say(tmp_path: Path, sessions: int) 
 
 
 def test_every_table_in_one_line(tmp_path: Path) -> None:
-    lab = collect(make_lab(tmp_path), tmp_path / "lab").folder
+    lab = tmp_path / "lab"
+    collect(make_lab(tmp_path), lab)
     for table, columns in lab_tables.TABLES.items():
         frame = pd.read_parquet(lab / table)
         assert list(frame.columns) == [*columns, "device"]
@@ -203,10 +204,10 @@ def test_sessions_without_a_date_come_first_and_a_damaged_run_is_named(tmp_path:
     runs = make_lab(tmp_path, sessions=3)
     Made("undated", None, estimates(4)).write(runs)
     (runs / "s02" / "models/base/identify.json").write_text("{")
-    found = collect(runs, tmp_path / "lab")
-    assert [one.session for one in found.content.sessions] == ["undated", "s01", "s03"]
-    assert len(found.skipped) == 1
-    assert re.match(r"s02: .*identify\.json, line 1: not JSON", found.skipped[0])
+    _, found = collect(runs, tmp_path / "lab")
+    assert found.sessions == ("undated", "s01", "s03")
+    (skipped,) = found.skipped
+    assert re.match(r"s02: .*identify\.json, line 1: not JSON", skipped)
 
 
 @pytest.mark.parametrize(
@@ -224,8 +225,8 @@ def test_a_result_of_another_form_leaves_its_run_out(
 ) -> None:
     runs = make_lab(tmp_path, sessions=2)
     (runs / "s01" / name).write_text(json.dumps(content))
-    found = collect(runs, tmp_path / "lab")
-    assert [one.session for one in found.content.sessions] == ["s02"]
+    _, found = collect(runs, tmp_path / "lab")
+    assert found.sessions == ("s02",)
     (skipped,) = found.skipped
     assert skipped.startswith("s01: ") and "\n" not in skipped
 
@@ -236,9 +237,9 @@ def test_a_result_that_was_edited_leaves_its_run_out(tmp_path: Path) -> None:
     outputs = {"models/base/identify.json": digest_file(path)}
     step = {"key": "0" * 64, "code": "0" * 64, "outputs": outputs}
     write_result(runs / "s01", RunResult, stages={"identify:base": step})
-    assert collect(runs, tmp_path / "lab").skipped == ()
+    assert collect(runs, tmp_path / "lab")[1].skipped == ()
     path.write_text(path.read_text().replace("4.", "5.", 1))
-    (skipped,) = collect(runs, tmp_path / "lab").skipped
+    (skipped,) = collect(runs, tmp_path / "lab")[1].skipped
     assert "models/base/identify.json was changed since identify:base wrote it" in skipped
     with pytest.raises(InputError, match="was changed since"):
         accept(runs / "s01", "base", tmp_path / "accepted")
@@ -280,14 +281,14 @@ def test_the_report_says_what_the_trends_say(
 def test_words_about_limits_are_true_of_the_charts(
     tmp_path: Path, sessions: int, limits: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = collect(make_lab(tmp_path, sessions=sessions), tmp_path / "lab")
+    trends, about = collect(make_lab(tmp_path, sessions=sessions), tmp_path / "lab")
     page = (tmp_path / "lab/report.html").read_text(encoding="utf-8")
-    assert all(chart.has_limits is limits for chart in found.content.series)
+    assert all(chart.has_limits is limits for chart in trends.series)
     said = "in control" if limits else "no limits yet"
-    assert {phrases.verdict(found.content, one) for one in found.content.sessions} == {said}
+    assert {phrases.verdict(trends, one) for one in trends.sessions} == {said}
     assert ("The band is the control limits" in page) is limits
     assert ("Control limits need 6 sessions of this device" in page) is not limits
-    lab_command.table(found)
+    lab_command.table(tmp_path / "lab", trends, about)
     assert ("no control limits yet" in capsys.readouterr().out) is not limits
 
 
