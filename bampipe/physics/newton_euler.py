@@ -224,20 +224,6 @@ def _unit_wrenches(at: _LinkMotion) -> tuple[Columns, Columns]:
     return force, moment
 
 
-def mass_matrix(
-    algebra: Algebra, links: Sequence[Link], inertial: Sequence[Sequence[Any]], q: Entries
-) -> list[list[Any]]:
-    """Return the mass matrix: column by column, the forces of a unit acceleration at rest."""
-    n = len(q)
-    mass: list[list[Any]] = [[0] * n for _ in range(n)]
-    for j in range(n):
-        unit = [int(i == j) for i in range(n)]
-        forces = joint_forces(algebra, links, inertial, q, [0] * n, unit, (0, 0, 0))
-        for i in range(j + 1):
-            mass[i][j] = mass[j][i] = forces[i, 0]
-    return mass
-
-
 def _link_motions(
     a: Algebra,
     links: Sequence[Link],
