@@ -175,8 +175,7 @@ def _describe_robot(device: Device, robot: Robot) -> str:
     count, combined = len(robot.parameters), len(base_parameters(robot))
     lines += [f"Of {count} inertial numbers {free} act on some joint, in {combined} combinations."]
     lines += [f"Physically impossible: {line}." for line in robot.impossible]
-    own = {p.name for p in robot.parameters}
-    lines += ["", "Numbers", *_list_numbers(device, own)]
+    lines += ["", "Numbers", *_list_numbers(device, {p.name for p in robot.parameters})]
     return "\n".join(lines) + "\n"
 
 

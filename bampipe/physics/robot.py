@@ -182,7 +182,7 @@ class Robot(Declaration):
     )
 
     def cross_faults(self) -> Iterator[InputError]:
-        known: list[str] = []
+        known, alone = list[str](), [joint.name for joint in self.moving]
         for joint in self.joints:
             if joint.after and joint.after not in known:
                 yield InputError(
@@ -191,8 +191,6 @@ class Robot(Declaration):
                     remedy="the joint before stands first; leave it out for the base",
                 )
             known.append(joint.name)
-        alone = [joint.name for joint in self.moving]
-        for joint in self.joints:
             if joint.follows and joint.follows not in alone:
                 yield InputError(
                     f"there is no joint {joint.follows!r} that follows none",
