@@ -16,6 +16,7 @@ import bampipe
 from bampipe.cli import one_stage, places, show
 from bampipe.cli.next_step import after_loop, after_proposal, after_run
 from bampipe.errors import InputError
+from bampipe.phrases.results import describe_unidentified
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult
@@ -491,13 +492,9 @@ def test_notes_of_the_logs_and_a_second_that_stands_out_are_said(
     ]
 
 
-def test_an_effect_that_is_not_identified_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_effect_that_is_not_identified_is_said() -> None:
     why = "`stribeck.joint.force` is 18 \u00b1 46 N.m, an interval larger than itself"
-    show.print_unidentified(
-        {
-            "play:joint": EffectEstimate(identified=True),
-            "stribeck:joint": EffectEstimate(identified=False, reasons=(why,)),
-        }
-    )
-    said = f"note: `stribeck:joint` does not count as identified: {why}.\n"
-    assert capsys.readouterr().out == said
+    found = EffectEstimate(identified=False, reasons=(why,))
+    said = f"`stribeck:joint` does not count as identified: {why}."
+    assert describe_unidentified("stribeck:joint", found) == said
+    assert describe_unidentified("play:joint", EffectEstimate(identified=True)) == ""

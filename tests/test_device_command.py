@@ -105,7 +105,6 @@ def test_built_in_devices_fit(name: str, command: Command) -> None:
     [
         (("device", "check", "bma"), "unknown device 'bma', did you mean 'bam'"),
         (("device", "check", "absent.toml"), "absent.toml: no such file"),
-        (("device", "show", "absent.toml"), "absent.toml: no such file"),
         (("effects", "stribek"), "did you mean 'stribeck'"),
         (("effects", "stribeck:yow"), "did you mean 'yaw'"),
         (("effects", "absent.toml"), "no such file"),

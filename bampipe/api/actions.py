@@ -14,7 +14,6 @@ from bampipe.run import pipeline as pipelines
 from bampipe.run.events import ignore_event
 from bampipe.run.request import Request
 from bampipe.run.session_name import session_folder, session_id
-from bampipe.stages import base
 
 Path_ = str | Path
 RUNS = "runs"
@@ -163,7 +162,6 @@ def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object)
     Raises:
         InputError: the stage, model or setting does not exist, or an earlier stage has not run.
     """
-    base.check_stage_name(stage)
     _, steps = _run_stage(run, stage, model, settings)
     return steps[0] if len(steps) == 1 else {"steps": steps}
 

@@ -10,7 +10,7 @@ from bampipe.cli.options import RUNS, JsonOption, QuietOption, RunsOption
 from bampipe.errors import InputError
 
 if TYPE_CHECKING:
-    from bampipe.lab.collect import Lab
+    from bampipe.results.lab import LabResult, TrendsResult
 
 MOST_SESSIONS = 60
 
@@ -37,24 +37,25 @@ def lab(
 
     Example: bampipe lab /data/runs --out /data/lab
     """
+    from bampipe.lab.folders import lab_folder
+
     folder = folder or runs
     if not folder.is_dir():
         raise InputError("no such folder of runs", where=str(folder))
-    found = gather(folder, out, quiet or json)
+    out = out or lab_folder(folder)
+    trends, about = gather(folder, out, quiet or json)
     if json:
-        show.print_json(found.content.model_dump(mode="json"))
+        show.print_json(trends.model_dump(mode="json"))
         return
-    table(found)
-    remedies = (one.remedy for one in found.content.sessions if one.remedy)
-    show.print_advice(next(remedies, f"open {found.folder / 'report.html'}"), quiet)
+    table(out, trends, about)
+    remedies = (one.remedy for one in trends.sessions if one.remedy)
+    show.print_advice(next(remedies, f"open {out / 'report.html'}"), quiet)
 
 
-def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> "Lab":
-    """Write the lab's folder for the runs in ``runs``."""
+def gather(runs: Path, folder: Path, quiet: bool) -> "tuple[TrendsResult, LabResult]":
+    """Write the lab's ``folder`` for the runs in ``runs``."""
     from bampipe.lab.collect import collect
-    from bampipe.lab.folders import lab_folder
 
-    folder = out or lab_folder(runs)
     with show.Watcher(quiet) as watcher:
         return collect(runs, folder, progress=watcher.follow(str(folder), "lab"))
 
@@ -73,34 +74,34 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
         if not quiet:
             show.note(f"bampipe: {folder} holds other files; collect with `bampipe lab --out`")
         return
-    found = gather(runs, None, quiet)
+    trends, about = gather(runs, folder, quiet)
     if not quiet and several:
         show.say("")
-        table(found)
-        show.print_advice(f"open {found.folder / 'report.html'}, which links every session")
+        table(folder, trends, about)
+        show.print_advice(f"open {folder / 'report.html'}, which links every session")
 
 
-def table(found: "Lab") -> None:
+def table(folder: Path, trends: "TrendsResult", about: "LabResult") -> None:
     """Print the sessions, and the trends."""
     from bampipe.phrases import lab as phrases
 
-    sessions = found.content.sessions
+    sessions = trends.sessions
     odd = [one for one in sessions if one.verdict != "in control"]
     many = "session" if len(sessions) == 1 else "sessions"
     stand = "stands" if len(odd) == 1 else "stand"
-    show.say(f"{found.folder}: {len(sessions)} {many}, {len(odd)} {stand} out")
+    show.say(f"{folder}: {len(sessions)} {many}, {len(odd)} {stand} out")
     rows = []
     for one in sessions if len(sessions) <= MOST_SESSIONS else odd:
         when = one.recorded[:16].replace("T", " ")
         worst = f"{one.worst[0]:.3g} {one.worst[1]}" if one.worst else None
-        verdict = phrases.verdict(found.content, one)
+        verdict = phrases.verdict(trends, one)
         rows.append([one.session, when, one.model, worst, verdict, one.sentence])
     if rows:
         show.print_table(["session", "recorded", "model", "error / floor", "verdict", ""], rows)
-    for line in phrases.list_trends(found.content.series):
+    for line in phrases.list_trends(trends.series):
         show.say(line)
-    fewest = found.content.fewest_sessions
-    if found.content.series and not any(chart.has_limits for chart in found.content.series):
+    if trends.series and not any(chart.has_limits for chart in trends.series):
+        fewest = trends.fewest_sessions
         show.say(f"no control limits yet: they need {fewest} sessions of a device")
-    for line in found.skipped:
+    for line in about.skipped:
         show.say(f"left out: {line}")

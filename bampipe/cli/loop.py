@@ -102,6 +102,7 @@ def extend(
     """
     from bampipe.api import loop
     from bampipe.cli.next_step import after_loop
+    from bampipe.phrases.results import describe_unidentified
     from bampipe.results.compare import CompareResult
     from bampipe.results.identify import IdentifyResult
     from bampipe.run import batch, models, record
@@ -135,7 +136,9 @@ def extend(
         return
     show.say(f"{root}: {last}")
     show.print_summary(ladder)
-    show.print_unidentified(RunFolder(root).read(IdentifyResult, last).effects)
+    effects_found = RunFolder(root).read(IdentifyResult, last).effects
+    for said in filter(None, map(describe_unidentified, effects_found, effects_found.values())):
+        show.say(f"note: {said}")
     asked = f"bampipe diagnose RUN{RunFolder(root).model_option(last)}"
     command = after_loop(root, last) if auto else asked
     show.print_advice(command.replace("RUN", places.next_to(root, runs)), quiet, json)

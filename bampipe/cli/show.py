@@ -17,7 +17,6 @@ from bampipe.run.events import Event
 
 if TYPE_CHECKING:
     from bampipe.results.compare import Rung
-    from bampipe.results.identify import EffectEstimate
     from bampipe.run.request import Outcome
 
 LARGEST_TABLE = 40
@@ -250,15 +249,6 @@ def print_outcome(result: "Outcome") -> None:
         _print_model(result.model)
 
 
-def print_unidentified(effects: "Mapping[str, EffectEstimate]") -> None:
-    """Print which effects of a model do not count as identified, and why."""
-    from bampipe.phrases.results import describe_unidentified
-
-    for name, found in effects.items():
-        if not found.identified:
-            say(f"note: {describe_unidentified(name, found)}")
-
-
 def print_advice(command: str, quiet: bool = False, json: bool = False) -> None:
     """Print the command to go on with, unless the output is quiet or JSON."""
     if not quiet and not json:
@@ -286,8 +276,7 @@ class Watcher:
         self.several = several
         self.bars: Any = None
         self.tasks: dict[str, Any] = {}
-        self.lines: dict[str, tuple[float, Event]] = {}
-        self.written: dict[str, float] = {}
+        self.lines: dict[str, tuple[float, float, Event]] = {}
         self.lock, self.over = threading.Lock(), threading.Event()
 
     def __enter__(self) -> Self:
@@ -349,20 +338,19 @@ class Watcher:
             if event.kind == "start":
                 note(f"{name} ({event.message})" if event.message else name)
             if event.kind in ("start", "progress"):
-                self.lines[name] = (self.lines.get(name, (now,))[0], event)
-                self.written.setdefault(name, now)
+                started, written, _ = self.lines.get(name, (now, now, event))
+                self.lines[name] = (started, written, event)
             else:
                 self.lines.pop(name, None)
-                self.written.pop(name, None)
         self.write_late_lines()
 
     def write_late_lines(self) -> None:
         """Write a line on each step that has had none for some time."""
         with self.lock:
-            for name, (started, event) in self.lines.items():
+            for name, (started, written, event) in self.lines.items():
                 now = time.monotonic()
-                if now - self.written[name] >= QUIET_S:
-                    self.written[name] = now
+                if now - written >= QUIET_S:
+                    self.lines[name] = (started, now, event)
                     percent = f"{100.0 * event.fraction:.0f} %, {now - started:.0f} s"
                     said = event.message if event.kind == "progress" else ""
                     note(f"{name}: {percent}, {said}".removesuffix(", "))

@@ -1,7 +1,6 @@
 """Collect the runs of a lab: tables, trends and a report, from all stages that have run."""
 
 import os
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
@@ -18,28 +17,13 @@ from bampipe.run.lock import hold
 _EARLIEST = datetime.min.replace(tzinfo=UTC)
 
 
-@dataclass(frozen=True)
-class Lab:
-    """A lab's folder, and its content.
-
-    Attributes:
-        content: of ``trends.json``.
-        skipped: one line on each run folder that could not be read.
-    """
-
-    folder: Path
-    content: TrendsResult
-    skipped: tuple[str, ...]
-
-
-def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress = silent) -> Lab:
+def collect(
+    runs: Path, folder: Path, progress: Progress = silent
+) -> tuple[TrendsResult, LabResult]:
     """Read every run in ``runs`` and write the lab's folder anew.
 
     A run that cannot be read is left out and named. Every file is replaced whole; ``lab.json``
-    comes last.
-
-    Args:
-        report: whether to write report.pdf and report.html too.
+    comes last. Returns the content of ``trends.json`` and of ``lab.json``.
 
     Raises:
         InputError: there is no run in ``runs``, or a file cannot be written.
@@ -70,25 +54,25 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
     with hold(folder, LOCK):  # simultaneous collections take turns
         counts = lab_tables.write(folder, tables)
         content.write(folder)
-        if report:
-            progress(0.7, "report")
-            # matplotlib is slow to import: only here
-            from bampipe.report.lab_report import build_lab_report
+        progress(0.7, "report")
+        # matplotlib is slow to import: only here
+        from bampipe.report.lab_report import build_lab_report
 
-            # The folders of the sessions' reports, relative to the lab's.
-            reports = {root.name: root.resolve() / "report" for root in roots}
-            pages = {
-                name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
-                for name, report in reports.items()
-                if (report / "explore.html").is_file()
-            }
-            made = build_lab_report(folder, pages)
-            made.write(folder)
-            for old in (folder / "figures").glob("*.svg"):
-                if old.stem not in made.figures:
-                    old.unlink()
+        # The folders of the sessions' reports, relative to the lab's.
+        reports = {root.name: root.resolve() / "report" for root in roots}
+        pages = {
+            name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
+            for name, report in reports.items()
+            if (report / "explore.html").is_file()
+        }
+        made = build_lab_report(folder, pages)
+        made.write(folder)
+        for old in (folder / "figures").glob("*.svg"):
+            if old.stem not in made.figures:
+                old.unlink()
         sessions = tuple(str(one.key["session_id"]) for one in found)
-        LabResult(
+        lab = LabResult(
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
-        ).write(folder)
-    return Lab(folder, content, tuple(skipped))
+        )
+        lab.write(folder)
+    return content, lab

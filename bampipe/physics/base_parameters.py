@@ -44,11 +44,10 @@ def base_parameters(robot: Robot) -> list[BaseParameter]:
     names = [p.name for p in robot.parameters]
     columns = robot.regressor
     size = np.linalg.norm(columns, axis=0)
-    order = [k for k, matters in enumerate(robot.matters.ravel()) if matters]
     chosen: list[int] = []
     basis = np.zeros((len(columns), 0))
     terms: dict[int, dict[str, float]] = {}
-    for k in order:
+    for k in np.flatnonzero(robot.matters).tolist():
         unit = columns[:, k] / size[k]
         left = unit - basis @ (basis.T @ unit)
         left -= basis @ (basis.T @ left)

@@ -209,18 +209,6 @@ def function_source(
     return f"\n\ndef {name}({', '.join(groups)}):\n    " + "\n    ".join(body) + "\n"
 
 
-def print_portable(e: Equations, parameters: Mapping[Any, float]) -> Block:
-    """Return the force that a motion requires, by axis, as text with numbers for the parameters.
-
-    Args:
-        e: the equations of a model without internal states; parameters: value of each symbol.
-    """
-    numbers = {symbol: sp.Float(value) for symbol, value in parameters.items()}
-    required = [sp.sympify(force, strict=True).xreplace(numbers) for force in e.required]
-    steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
-    return print_block(required, steps)
-
-
 def array_source(e: Equations, added: Sequence[Any]) -> str:
     """Return the source of functions over columns; ``added``: residual terms of effects."""
     results = {

@@ -20,14 +20,7 @@ from bampipe.physics.effect import Ahead, BoundEffect
 from bampipe.physics.equations import Dependence, Equations
 from bampipe.physics.lagrange import allow, check_inertia, lagrange
 from bampipe.physics.model import Model
-from bampipe.physics.newton_euler import (
-    INERTIAL,
-    Link,
-    Text,
-    Vector,
-    joint_forces,
-    mass_matrix,
-)
+from bampipe.physics.newton_euler import INERTIAL, Link, Text, Vector, joint_forces
 from bampipe.physics.robot import gravity_vector
 from bampipe.physics.signals import ActingInputs, order_of_action
 from bampipe.physics.time_limit import OutOfTime, time_limit
@@ -336,7 +329,10 @@ def _apply_newton_euler(
     inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
     zeros = [0] * len(q)
     # Everything has a name: one compiled function serves every model of this robot.
-    mass = text.name(np.array(mass_matrix(text, links, inertial, q))).tolist()
+    # The mass matrix: column by column, the forces of a unit acceleration at rest.
+    units, at_rest = np.eye(len(q), dtype=int), (links, inertial, q, zeros)
+    columns = np.hstack([joint_forces(text, *at_rest, unit, (0, 0, 0)) for unit in units])
+    mass = text.name(np.triu(columns) + np.triu(columns, 1).T).tolist()
     bias, dynamics = (
         text.name(joint_forces(text, links, inertial, q, qd, a, gravity))[:, 0].tolist()
         for a in (zeros, qdd)

@@ -236,7 +236,11 @@ class Effect(DeclaredFile):
                 and ("dry" not in self.names or device.has_dry_friction(c.name))
             }
         if self.scope == "axis_pair":
-            return self._pair_axes(device)
+            # Neighbouring joints where it acts on both, else axes that lie near each other.
+            if self.kind == "energy" or (isinstance(self.torque, Mapping) and len(self.torque) > 1):
+                return _list_neighbours(device)
+            names = [c.name for c in device.coordinates]
+            return _pair_near(names, names, _FARTHEST if device.robot is None else 1, "-")
         if self.scope == "channel":
             return {name: (name,) for name in device.channels}
         if self.scope == "force_component":
@@ -246,16 +250,6 @@ class Effect(DeclaredFile):
             farthest, between = (1, "-") if device.robot else (len(device.forces), "")
             return _pair_near(device.components, device.forces, farthest, between)
         return {"": ()} if self._fits_device(device) else {}
-
-    def _pair_axes(self, device: Device) -> dict[str, tuple[str, str]]:
-        """The pairs of axes of ``device`` that it makes sense for, by what follows the colon.
-
-        Neighbouring joints where it acts on both, else axes that lie near each other, either way.
-        """
-        if self.kind == "energy" or (isinstance(self.torque, Mapping) and len(self.torque) > 1):
-            return _list_neighbours(device)
-        names = [c.name for c in device.coordinates]
-        return _pair_near(names, names, _FARTHEST if device.robot is None else 1, "-")
 
     @cached_property
     def names(self) -> set[str]:

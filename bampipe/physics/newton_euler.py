@@ -43,7 +43,7 @@ class Link:
     slides: bool
     axis: Vector
     position: Vector
-    rotation: tuple[Vector, Vector, Vector]
+    rotation: tuple[Vector, ...]
     follows: int = -1
     ratio: float = 1.0
     zero: float = 0.0
@@ -222,20 +222,6 @@ def _unit_wrenches(at: _LinkMotion) -> tuple[Columns, Columns]:
         [none, ay, -ax, none, -x * y, x * x - y * y, dx - y * z, x * y, dy + x * z, dz],
     ])  # fmt: skip
     return force, moment
-
-
-def mass_matrix(
-    algebra: Algebra, links: Sequence[Link], inertial: Sequence[Sequence[Any]], q: Entries
-) -> list[list[Any]]:
-    """Return the mass matrix: column by column, the forces of a unit acceleration at rest."""
-    n = len(q)
-    mass: list[list[Any]] = [[0] * n for _ in range(n)]
-    for j in range(n):
-        unit = [int(i == j) for i in range(n)]
-        forces = joint_forces(algebra, links, inertial, q, [0] * n, unit, (0, 0, 0))
-        for i in range(j + 1):
-            mass[i][j] = mass[j][i] = forces[i, 0]
-    return mass
 
 
 def _link_motions(

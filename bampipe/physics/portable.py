@@ -6,9 +6,11 @@ nothing but the mathematics that comes with the language.
 
 from typing import Literal
 
+import sympy as sp
+
 from bampipe.arrays import Array
 from bampipe.errors import InputError
-from bampipe.physics.codegen import print_portable, unpack_groups
+from bampipe.physics.codegen import print_block, unpack_groups
 from bampipe.physics.derivation import derive
 from bampipe.physics.model import Model
 
@@ -85,7 +87,9 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
                 remedy="export a model without it",
             )
     e = derive(model)
-    block = print_portable(e, dict(zip(e.p, map(float, parameters), strict=True)))
+    numbers = {p: sp.Float(float(value)) for p, value in zip(e.p, parameters, strict=True)}
+    required = [sp.sympify(force, strict=True).xreplace(numbers) for force in e.required]
+    block = print_block(required, [(name, value.xreplace(numbers)) for name, value in e.steps])
     inputs = [symbol for symbol in e.u if symbol in block.used]
     names = [e.inputs[e.u.index(symbol)] for symbol in inputs]
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "u": inputs}

@@ -50,15 +50,16 @@ def describe_equations(device: Device) -> str:
     """
     if device.robot is not None:
         return _describe_robot(device, device.robot)
-    potential, equations = _print_equations(Model(device), {})
+    model = Model(device)
+    known = _print_templates(model, [p.name for p in model.parameters])
     axes = (
         f"  {c.symbol} = {c.name}, {c.unit}; generalised force in {c.torque_unit}"
         for c in device.coordinates
     )
     lines = [
         f"{device.name}: {device.summary}", "", "Coordinates", *axes,
-        "", "Energies", "  kinetic   = q'ᵀ M q' / 2", f"  potential = {potential}",
-        "", "M q'' + h = Q, where", *(f"  {line}" for line in equations),
+        "", "Energies", "  kinetic   = q'ᵀ M q' / 2", f"  potential = {known['potential']}",
+        "", "M q'' + h = Q, where", *(f"  {left}{right}" for left, right in known["lines"]),
         "", "Numbers", *_list_numbers(device),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
@@ -67,6 +68,8 @@ def describe_equations(device: Device) -> str:
 def model_equations(model: Model, values: Mapping[str, float]) -> tuple[str, ...]:
     """The equations of motion of a model with its effects, ``values`` of parameters put in.
 
+    They are derived once for each content of the model, then read from the cache.
+
     Returns:
         Lines for the entries of M, h and Q of M q'' + h = Q, and for the rates of internal states;
         parameters without a value, and numbers of the device, stand by their names.
@@ -74,19 +77,7 @@ def model_equations(model: Model, values: Mapping[str, float]) -> tuple[str, ...
     Raises:
         InputError: an expression is wrong, or deriving takes too long.
     """
-    return _print_equations(model, values)[1]
-
-
-def _print_equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
-    """The potential energy, and the lines of the equations of motion.
-
-    With numbers in them they are derived once for each content of the model, then read from the
-    cache.
-    """
     names = [p.name for p in model.parameters]
-    if not values:
-        known = _print_templates(model, names)
-        return known["potential"], tuple("".join(line) for line in known["lines"])
     places = [f"#{number}#" for number in range(len(names))]
     code = generated_code.load(
         f"{model.key}_print_equations", lambda: (_print_templates(model, places), {})
@@ -98,8 +89,7 @@ def _print_equations(model: Model, values: Mapping[str, float]) -> tuple[str, tu
         # Otherwise two numbers would read as one.
         return re.sub(r"(?<=[\w)]) (?=\d)", " · ", _join_signs(text))
 
-    lines = (left + fill_template(right) for left, right in code.facts["lines"])
-    return fill_template(code.facts["potential"]), tuple(lines)
+    return tuple(left + fill_template(right) for left, right in code.facts["lines"])
 
 
 def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
@@ -188,8 +178,7 @@ def _describe_robot(device: Device, robot: Robot) -> str:
     count, combined = len(robot.parameters), len(base_parameters(robot))
     lines += [f"Of {count} inertial numbers {free} act on some joint, in {combined} combinations."]
     lines += [f"Physically impossible: {line}." for line in robot.impossible]
-    own = {p.name for p in robot.parameters}
-    lines += ["", "Numbers", *_list_numbers(device, own)]
+    lines += ["", "Numbers", *_list_numbers(device, {p.name for p in robot.parameters})]
     return "\n".join(lines) + "\n"
 
 

@@ -182,7 +182,7 @@ class Robot(Declaration):
     )
 
     def cross_faults(self) -> Iterator[InputError]:
-        known: list[str] = []
+        known, alone = list[str](), [joint.name for joint in self.moving]
         for joint in self.joints:
             if joint.after and joint.after not in known:
                 yield InputError(
@@ -191,8 +191,6 @@ class Robot(Declaration):
                     remedy="the joint before stands first; leave it out for the base",
                 )
             known.append(joint.name)
-        alone = [joint.name for joint in self.moving]
-        for joint in self.joints:
             if joint.follows and joint.follows not in alone:
                 yield InputError(
                     f"there is no joint {joint.follows!r} that follows none",
@@ -236,7 +234,7 @@ class Robot(Declaration):
                 place.get(joint.after, -1), joint.kind == "prismatic",
                 _keep_integers(np.array(joint.axis) / math.hypot(*joint.axis)),
                 _keep_integers(np.array(joint.position)),
-                _matrix_rows(rotation_matrix(joint.rotation)),
+                tuple(map(_keep_integers, rotation_matrix(joint.rotation))),
                 place.get(joint.follows, -1), joint.ratio, joint.zero,
             )
             for joint in self.joints
@@ -377,7 +375,3 @@ def _keep_integers(vector: Array) -> Vector:
         near = round(float(value))
         entries.append(near if abs(value - near) < _ROUNDING and abs(near) <= 1 else float(value))
     return entries[0], entries[1], entries[2]
-
-
-def _matrix_rows(matrix: Array) -> tuple[Vector, Vector, Vector]:
-    return _keep_integers(matrix[0]), _keep_integers(matrix[1]), _keep_integers(matrix[2])

@@ -19,7 +19,10 @@ def structure_code(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     equations = derive(model, named_constants=True)
     groups, numbers, pivots = _separate_numbers(model, equations)
     facts = {"together": groups, "numbers": numbers}
-    return facts, {"slopes": ARRAY_HEADER + _print_slopes(model, equations, pivots)}
+    at = {constant_symbol(name): sp.Float(c.value) for name, c in model.device.constants.items()}
+    slopes = [sp.diff(r, constant_symbol(n)).subs(at) for r in equations.residual for n in pivots]
+    text = function_source("slopes", equations.groups("q qd qdd z u p"), slopes, equations.steps)
+    return facts, {"slopes": ARRAY_HEADER + text}
 
 
 def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any], list[str]]:
@@ -129,12 +132,3 @@ def _select_distinct(factors: Sequence[Any]) -> list[Any]:
         if all(not sp.cancel(factor / other).is_number for other in terms_kept):
             terms_kept.append(-factor if str(factor).startswith("-") else factor)
     return terms_kept
-
-
-def _print_slopes(model: Model, e: Equations, pivots: Sequence[str]) -> str:
-    """Source of the slopes of the residual by the constants ``pivots``, axis by axis."""
-    numbers: Mapping[Any, Any] = {
-        constant_symbol(name): sp.Float(c.value) for name, c in model.device.constants.items()
-    }
-    slopes = [sp.diff(r, constant_symbol(n)).subs(numbers) for r in e.residual for n in pivots]
-    return function_source("slopes", e.groups("q qd qdd z u p"), slopes, e.steps)

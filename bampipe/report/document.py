@@ -34,18 +34,15 @@ def split_spans(text: str) -> list[Span]:
     found: list[Span] = []
     end = 0
     for match in _MARK.finditer(text):
-        if match.start() > end:
-            found.append(("plain", show(text[end : match.start()])))
-        if match["strong"] is not None:
+        found.append(("plain", show(text[end : match.start()])))
+        if match["strong"]:
             found.append(("strong", show(match["strong"])))
-        elif match["code"] is not None:
+        elif match["code"]:
             found.append(("code", match["code"]))
         else:
             found.append(("link", f"{match['words']}\n{match['page']}"))
         end = match.end()
-    if end < len(text):
-        found.append(("plain", show(text[end:])))
-    return found
+    return [span for span in (*found, ("plain", show(text[end:]))) if span[1]]
 
 
 def strip_marks(text: str) -> str:

@@ -1,6 +1,8 @@
 """Base classes of records: typed, immutable, read and written whole."""
 
 import json
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -82,13 +84,13 @@ class Result(Record):
         Raises:
             InputError: no such file, or a wrong field, which is named.
         """
-        content = read_json_table(path)
+        content: Any = read_json_table(path)
         try:
             return cls._checked(content)
         except ValidationError as error:
-            for fault in error.errors():
-                if fault["type"] == "extra_forbidden":
-                    _drop(content, fault["loc"])
+            places = [f["loc"] for f in error.errors() if f["type"] == "extra_forbidden"]
+            for *tables, last in places:
+                del reduce(getitem, tables, content)[last]
         try:
             return cls._checked(content)
         except ValidationError as error:
@@ -108,9 +110,3 @@ class Result(Record):
         content = self.model_dump(mode="json")
         write_json(folder / self.file(getattr(self, "model", "")), content)
         return content
-
-
-def _drop(content: Any, place: tuple[int | str, ...]) -> None:
-    for part in place[:-1]:
-        content = content[part]
-    del content[place[-1]]

@@ -50,6 +50,8 @@ def write(root: Path, model: ModelFile) -> None:
 def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
     """Write the base model, with the device of the pipeline or else of the session.
 
+    The effects that the lab has adopted are copied beside it, for the diagnosis.
+
     Args:
         device: the pipeline's device; "" for that of ``ingest/session.json``.
         effects: the pipeline's effects; if there are none, those of the device file.
@@ -58,19 +60,13 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
         session = RunFolder(root).read(IngestResult)
         device = session.device
         effects = effects or session.default_effects
-    _bring_adopted_effects(root)
-    write(root, ModelFile(name=BASE, device=device, effects=effects))
-
-
-def _bring_adopted_effects(root: Path) -> None:
-    """Copy the effects that the lab has adopted to the base model, for the diagnosis."""
-    for source in sorted((root.parent / ADOPTED).glob("*.toml")):
-        if source.is_symlink():
-            continue
+    adopted = (root.parent / ADOPTED).glob("*.toml")
+    for source in sorted(path for path in adopted if not path.is_symlink()):
         text = source.read_text(encoding="utf-8")
         target = root / "models" / BASE / "effects" / source.name
         if not target.is_file() or target.read_text(encoding="utf-8") != text:
             write_text(target, text)
+    write(root, ModelFile(name=BASE, device=device, effects=effects))
 
 
 def child_name(parent: str, effects: tuple[str, ...]) -> str:

@@ -50,7 +50,7 @@ def publish(root: Path, url: str) -> str:
             return version
         for name, path in files.items():
             target = f"{here}/{version}/{name}"
-            if _size(system, target) != path.stat().st_size:
+            if not system.exists(target) or system.size(target) != path.stat().st_size:
                 system.makedirs(target.rpartition("/")[0], exist_ok=True)
                 system.put_file(str(path), target)
         content = {"schema": SCHEMA, "session": root.name, "version": version, "files": hashes}
@@ -145,12 +145,5 @@ def _current(system: Any, here: str) -> Published | None:
     try:
         system.invalidate_cache(here)
         return read(Published, parse_json(system.cat_file(place), place), place)
-    except FileNotFoundError:
-        return None
-
-
-def _size(system: Any, path: str) -> int | None:
-    try:
-        return int(system.info(path)["size"])
     except FileNotFoundError:
         return None

@@ -54,9 +54,9 @@ def make_lab(folder: Path, *changed: Made, sessions: int = 9) -> Path:
     return folder / "runs"
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports without figures and print, which take most of their time."""
+    """Reports without figures and print, which take most of their time, until a test undoes it."""
     monkeypatch.setattr(typeset, "render_pdf", lambda *_: b"")
     monkeypatch.setattr(style, "render_svg", lambda _: "<svg></svg>")
 
@@ -65,8 +65,8 @@ DRIFTED = made(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
 
 
 def verdicts(runs: Path) -> dict[str, dict[str, object]]:
-    found = collect(runs, runs.parent / "lab", report=False)
-    return {one["session"]: one for one in found.content.model_dump()["sessions"]}
+    found, _ = collect(runs, runs.parent / "lab")
+    return {one["session"]: one for one in found.model_dump()["sessions"]}
 
 
 @pytest.mark.parametrize(
@@ -145,14 +145,15 @@ def test_a_session_is_judged_by_its_best_confirmed_model(tmp_path: Path) -> None
 @pytest.mark.parametrize("sessions", [2, 9])
 def test_its_json_files_are_as_their_schemas_say(tmp_path: Path, sessions: int) -> None:
     drifted = made(2, estimates(2, coulomb__yaw=4.9), verdicts=MISSING)
-    collect(make_lab(tmp_path, drifted, sessions=sessions), tmp_path / "lab", report=False)
+    collect(make_lab(tmp_path, drifted, sessions=sessions), tmp_path / "lab")
     written = {path.name for path in (tmp_path / "lab").glob("*.json")}
     assert written == {"lab.json", "trends.json"}
     assert misfits(tmp_path / "lab") == []
 
 
 def test_every_table_in_one_line(tmp_path: Path) -> None:
-    lab = collect(make_lab(tmp_path), tmp_path / "lab", report=False).folder
+    lab = tmp_path / "lab"
+    collect(make_lab(tmp_path), lab)
     for table, columns in lab_tables.TABLES.items():
         frame = pd.read_parquet(lab / table)
         assert list(frame.columns) == [*columns, "device"]
@@ -168,7 +169,7 @@ def test_every_table_in_one_line(tmp_path: Path) -> None:
 def test_the_lines_in_the_documents_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every Python line of docs/lab.md runs on a lab, and finds rows."""
     make_lab(tmp_path)
-    collect(tmp_path / "runs", tmp_path / "lab", report=False)
+    collect(tmp_path / "runs", tmp_path / "lab")
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "docs/lab.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, re.S)
@@ -181,7 +182,10 @@ def test_the_lines_in_the_documents_work(tmp_path: Path, monkeypatch: pytest.Mon
         assert len(scope["found"]) > 0  # type: ignore[arg-type]
 
 
-def test_the_same_runs_give_the_same_bytes_and_a_lost_device_goes(tmp_path: Path) -> None:
+def test_the_same_runs_give_the_same_bytes_and_a_lost_device_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
     runs = make_lab(tmp_path, sessions=3)
     made(10, {"mass": 1.0}, device="rail/2").write(runs)
     lab = tmp_path / "lab"
@@ -200,10 +204,10 @@ def test_sessions_without_a_date_come_first_and_a_damaged_run_is_named(tmp_path:
     runs = make_lab(tmp_path, sessions=3)
     Made("undated", None, estimates(4)).write(runs)
     (runs / "s02" / "models/base/identify.json").write_text("{")
-    found = collect(runs, tmp_path / "lab", report=False)
-    assert [one.session for one in found.content.sessions] == ["undated", "s01", "s03"]
-    assert len(found.skipped) == 1
-    assert re.match(r"s02: .*identify\.json, line 1: not JSON", found.skipped[0])
+    _, found = collect(runs, tmp_path / "lab")
+    assert found.sessions == ("undated", "s01", "s03")
+    (skipped,) = found.skipped
+    assert re.match(r"s02: .*identify\.json, line 1: not JSON", skipped)
 
 
 @pytest.mark.parametrize(
@@ -221,8 +225,8 @@ def test_a_result_of_another_form_leaves_its_run_out(
 ) -> None:
     runs = make_lab(tmp_path, sessions=2)
     (runs / "s01" / name).write_text(json.dumps(content))
-    found = collect(runs, tmp_path / "lab", report=False)
-    assert [one.session for one in found.content.sessions] == ["s02"]
+    _, found = collect(runs, tmp_path / "lab")
+    assert found.sessions == ("s02",)
     (skipped,) = found.skipped
     assert skipped.startswith("s01: ") and "\n" not in skipped
 
@@ -233,9 +237,9 @@ def test_a_result_that_was_edited_leaves_its_run_out(tmp_path: Path) -> None:
     outputs = {"models/base/identify.json": digest_file(path)}
     step = {"key": "0" * 64, "code": "0" * 64, "outputs": outputs}
     write_result(runs / "s01", RunResult, stages={"identify:base": step})
-    assert collect(runs, tmp_path / "lab", report=False).skipped == ()
+    assert collect(runs, tmp_path / "lab")[1].skipped == ()
     path.write_text(path.read_text().replace("4.", "5.", 1))
-    (skipped,) = collect(runs, tmp_path / "lab", report=False).skipped
+    (skipped,) = collect(runs, tmp_path / "lab")[1].skipped
     assert "models/base/identify.json was changed since identify:base wrote it" in skipped
     with pytest.raises(InputError, match="was changed since"):
         accept(runs / "s01", "base", tmp_path / "accepted")
@@ -255,13 +259,16 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
 def test_current_until_a_run_changes(tmp_path: Path) -> None:
     runs, lab = make_lab(tmp_path), tmp_path / "lab"
     assert not is_current(runs, lab)
-    collect(runs, lab, report=False)
+    collect(runs, lab)
     assert is_current(runs, lab)
     made(11, estimates(11)).write(runs)
     assert not is_current(runs, lab)
 
 
-def test_the_report_says_what_the_trends_say(tmp_path: Path) -> None:
+def test_the_report_says_what_the_trends_say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
     collect(make_lab(tmp_path, DRIFTED), tmp_path / "lab")
     page = (tmp_path / "lab/report.html").read_text(encoding="utf-8")
     assert "s05: device drifted" in page
@@ -270,23 +277,21 @@ def test_the_report_says_what_the_trends_say(tmp_path: Path) -> None:
     assert (tmp_path / "lab/figures/charts-1.svg").is_file()
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(("sessions", "limits"), [(9, True), (3, False)])
 def test_words_about_limits_are_true_of_the_charts(
     tmp_path: Path, sessions: int, limits: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = collect(make_lab(tmp_path, sessions=sessions), tmp_path / "lab")
+    trends, about = collect(make_lab(tmp_path, sessions=sessions), tmp_path / "lab")
     page = (tmp_path / "lab/report.html").read_text(encoding="utf-8")
-    assert all(chart.has_limits is limits for chart in found.content.series)
+    assert all(chart.has_limits is limits for chart in trends.series)
     said = "in control" if limits else "no limits yet"
-    assert {phrases.verdict(found.content, one) for one in found.content.sessions} == {said}
+    assert {phrases.verdict(trends, one) for one in trends.sessions} == {said}
     assert ("The band is the control limits" in page) is limits
     assert ("Control limits need 6 sessions of this device" in page) is not limits
-    lab_command.table(found)
+    lab_command.table(tmp_path / "lab", trends, about)
     assert ("no control limits yet" in capsys.readouterr().out) is not limits
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_after_several_sessions_the_page_that_links_them_comes_next(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -296,7 +301,6 @@ def test_after_several_sessions_the_page_that_links_them_comes_next(
     assert said == f"next: open {tmp_path / 'lab/report.html'}, which links every session"
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_the_page_links_the_pages_of_every_session(tmp_path: Path) -> None:
     runs = make_lab(tmp_path, sessions=5)
     for name in ("report.html", "explore.html"):
@@ -310,7 +314,6 @@ def test_the_page_links_the_pages_of_every_session(tmp_path: Path) -> None:
     assert all((tmp_path / "out/lab" / target).is_file() for target in targets)
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_the_command(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     make_lab(tmp_path, DRIFTED)
     monkeypatch.chdir(tmp_path)

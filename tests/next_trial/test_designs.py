@@ -38,9 +38,6 @@ SEEN = Envelope(
     field=np.array([40.0, 40.0, 40.0]),
     levels={},
 )
-
-
-NOTHING_STATED = np.tile([-np.inf, np.inf], (3, 1)), np.full(3, np.nan)
 LIMITS = np.array([[-2.0, 2.0], [-1.2, 1.2], [0.75, 1.45]])
 TIMID = replace(
     SEEN,
@@ -56,7 +53,7 @@ def every_design(seen: Envelope) -> list[Primitive]:
 
 
 def test_where_the_device_states_nothing_no_design_leaves_what_the_trials_have_shown():
-    assert SEEN.widen(*NOTHING_STATED) is SEEN
+    assert SEEN.widen(np.tile([-np.inf, np.inf], (3, 1)), np.full(3, np.nan)) is SEEN
     designs = every_design(SEEN)
     assert len(designs) > 100
     for design in designs:
@@ -121,17 +118,13 @@ def made_rehearsal(seen: Envelope) -> SimpleNamespace:
 def test_what_is_worth_little_to_somebody_hasty_does_not_win():
     def worth(recorded: tuple[Primitive, int]) -> float:
         design, version = recorded
-        wide = design.strokes[design_axis(design)].high > 0.6
+        wide = design.strokes[0].high > 0.6
         exact = 1.0 + 0.01 * design.seconds
         return (3.0 * exact if version != HASTY else 0.0) if wide else exact
 
     ranked = rank_designs(DesignSpace(made_rehearsal(SEEN), 20.0, [0], with_brakes=True), worth)
-    assert ranked[0].design.strokes[design_axis(ranked[0].design)].high <= 0.6
+    assert ranked[0].design.strokes[0].high <= 0.6
     assert ranked[0].utility == pytest.approx(1.2)
-
-
-def design_axis(design: Primitive) -> int:
-    return next(iter(design.strokes))
 
 
 def test_each_parameter_gets_the_design_that_is_best_for_it():
@@ -155,7 +148,7 @@ def test_what_leaves_what_has_been_seen_is_recorded_in_two_trials():
     beyond = [design for design in every_design(seen) if any(find_beyond(design, seen))]
     assert {design.parts for design in beyond} == {2}
     for design in list_primitives(seen, 20.0, [0], with_rests=False):
-        stroke = design.strokes[design_axis(design)]
+        stroke = design.strokes[0]
         # Each of them has room for three strokes.
         longest = 1.875 * (stroke.high - stroke.low) / np.sqrt(stroke.slow * stroke.fast)
         assert design.parts == 1 or 3.0 * longest < 1.01 * design.part_s
@@ -188,8 +181,7 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
     hasty = follow_roughly(first, SEEN, np.random.default_rng(0), True)
     q, qd, _ = example_path(hasty.example, t)
     assert np.ptp(q[:, 0]) == pytest.approx(0.2, rel=0.02)
-    usual = np.abs(qd[1000:2500, 0]).max()
-    assert usual == pytest.approx(0.8, rel=0.01)
+    assert np.abs(qd[1000:2500, 0]).max() == pytest.approx(0.8, rel=0.01)
     said = describe_design(first, SEEN, registry.device("bam"))
     assert said == (
         "Move yaw and pitch as in trial t01, yaw between −11° and 11° (−0.20 to 0.20 rad) at up to"
@@ -277,14 +269,14 @@ def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
     assert "than so far" not in describe_design(near, seen, device)
 
 
-def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
+def made_proposal(after: float) -> Proposal:
     pair = ExpectedConfusion(
         between=("force_gain:x", "base_tilt"), weight=1.0, before=0.4, after=after,
         left={"yaw": 1.0},
     )  # fmt: skip
     return Proposal(
         sentence="Move yaw.", seconds=20.0, moves={}, pose={}, worth=-after, information_gain=0.0,
-        confusion=(pair,), farther=farther,
+        confusion=(pair,),
     )  # fmt: skip
 
 

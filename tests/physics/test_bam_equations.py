@@ -219,13 +219,10 @@ RUBBER = made_up_effect(
 )  # fmt: skip
 
 
-EFFECTS = ("handle_payload", "base_tilt", "inertia_mismatch:yaw", "inertia_mismatch:extension")
-
-
 def test_energy_is_conserved_without_friction():
     """With effects of kind energy; those of the device are held against equations by hand."""
-    device = conservative_bam()
-    system = compile_model(Model(device, ("made_up", *EFFECTS), (RUBBER,)))
+    shipped = ("handle_payload", "base_tilt", "inertia_mismatch:yaw", "inertia_mismatch:extension")
+    system = compile_model(Model(conservative_bam(), ("made_up", *shipped), (RUBBER,)))
     p, u, w = typical_parameters(system), np.zeros(len(system.inputs)), np.zeros(len(system.noise))
 
     def derivative(_, x):

@@ -137,10 +137,8 @@ def test_what_is_compiled_is_what_is_printed(machine, effects):
         scale = np.abs(wanted).max(axis=0)
         assert np.all(np.abs(one - wanted) <= 1e-12 * scale)
         assert np.all(np.abs(many - wanted) <= 1e-12 * scale)
-    n, along = (
-        len(system.coordinates),
-        np.random.default_rng(5).normal(size=(3, count, len(system.coordinates))),
-    )
+    n = len(system.coordinates)
+    along = np.random.default_rng(5).normal(size=(3, count, n))
     z, q0 = x[:, 2 * n :], p[0]
     columns = system.applied(*along, z, u, q0) - system.required(*along, z, u, q0)
     scale = np.abs(columns).max()

@@ -274,20 +274,16 @@ def test_a_strip_of_a_map_is_marked_by_keyboard(page: Any) -> None:
         found = csv_of(page, "residual yaw by velocity")
         return found["velocity"][found["marked"] == 1]
 
-    canvas.focus()
     for _ in range(5):
-        page.keyboard.press("ArrowRight")
+        canvas.press("ArrowRight")
     near = marked_velocities()
-    canvas.focus()
-    page.keyboard.press("ArrowRight")
+    canvas.press("ArrowRight")
     far = marked_velocities()
     assert len(near) > 5 and far.mean() > near.mean()
-    canvas.focus()
-    page.keyboard.press("Shift+ArrowRight")
+    canvas.press("Shift+ArrowRight")
     wide = marked_velocities()
     assert len(wide) > len(far) and np.ptp(wide) > np.ptp(far)
-    canvas.focus()
-    page.keyboard.press("Escape")
+    canvas.press("Escape")
     assert not page.locator("#marked").is_visible()
 
 
@@ -300,16 +296,15 @@ def test_a_worst_window_is_one_choice_away(page: Any) -> None:
 
 
 def test_keys_move_view_and_cursor_and_the_reading_is_said(page: Any) -> None:
-    page.locator(".canvas").first.focus()
-    page.keyboard.press("PageDown")
+    canvas = page.locator(".canvas").first
+    canvas.press("PageDown")
     assert csv_of(page, "torque yaw")["trial"].unique().tolist() == [synthetic_run.FREE[0]]
-    page.locator(".canvas").first.focus()
-    page.keyboard.press("ArrowRight")
+    canvas.press("ArrowRight")
     said = page.locator("#reading").inner_text()
     assert said.startswith(f"{synthetic_run.FREE[0]}, 8.")
     assert "torque yaw: measured" in said and "version 1" in said
-    page.keyboard.press("+")
-    page.keyboard.press("+")
+    canvas.press("+")
+    canvas.press("+")
     assert np.ptp(csv_of(page, "torque yaw")["t (s)"]) < 4.1
 
 
@@ -443,13 +438,11 @@ def test_the_pose_is_that_at_the_cursor(opened: Opened, own_run: Path) -> None:
     page = opened(write_page(own_run))
     samples = pd.read_parquet(own_run / "ingest/samples.parquet")
     trial = samples[samples["trial_id"] == synthetic_run.FREE[0]].reset_index(drop=True)
-    drawn = []
-    page.locator(".canvas").first.focus()
-    page.keyboard.press("PageDown")
+    drawn, canvas = [], page.locator(".canvas").first
+    canvas.press("PageDown")
     for _ in range(4):
-        page.locator(".canvas").first.focus()
         for _ in range(12):
-            page.keyboard.press("ArrowRight")
+            canvas.press("ArrowRight")
         words = page.locator("#pose figcaption").inner_text()
         assert words.startswith(f"Pose in {synthetic_run.FREE[0]} at ")
         at = float(words.removesuffix(" s").rpartition(" ")[2])
@@ -519,8 +512,7 @@ def test_a_zoom_into_three_channels_of_a_million_samples_takes_a_moment(
     path = write_page(root)
     assert path.stat().st_size < 5.3e6
     page = opened(path)
-    page.locator(".canvas").first.focus()
     for key in "++++++----":
-        page.keyboard.press(key)
+        page.locator(".canvas").first.press(key)
     measured = "performance.getEntriesByType('measure').map((one) => one.duration)"
     assert 0.0 < float(np.min(page.evaluate(measured))) < 82.0

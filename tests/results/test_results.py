@@ -5,39 +5,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from made_results import filled
 from pydantic import ValidationError
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.results.compare import Rung
 from bampipe.results.ingest import IngestResult
-from bampipe.results.validate import AxisError, ForceError, JudgedError, TrialError, ValidateResult
+from bampipe.results.validate import AxisError, ValidateResult
 
-ERROR = AxisError(
-    rmse=1.0,
-    rmse_without_friction=2.0,
-    held_out_rmse=1.5,
-    relative_error_percent=10.0,
-    held_out_relative_error_percent=15.0,
-    fit_percent=None,
-    unit="N",
-)
-JUDGED = JudgedError(**ERROR.model_dump(), noise_floor=1.4, noise_floor_sd=0.1, standing="at_floor")
+ERROR = filled(AxisError)
 
 
-def made(**changes: Any) -> ValidateResult:
-    fields: dict[str, Any] = {
-        "model": "base",
-        "headline": "fit",
-        "cutoff_hz": {"yaw": 8.0},
-        "floor_replays": 1,
-        "failed_checks": (),
-        "notes": (),
-        "axes": {"yaw": JUDGED},
-        "trials": {"t01": TrialError(held_out=True, yaw=ERROR)},
-        "forces": {"force_x": ForceError(rmse=0.1, unit="N")},
-    }
-    return ValidateResult(**(fields | changes))
+def made(yaw: Any = ERROR) -> ValidateResult:
+    """A result with the error ``yaw`` of that axis."""
+    trials = {"t01": {"held_out": True, "yaw": ERROR}}
+    fields = {"model": "base", "axes": {"yaw": yaw}, "trials": trials}
+    return ValidateResult.model_validate(filled(ValidateResult, fields))
 
 
 def changed(root: Path, change: Any) -> Path:
@@ -52,7 +36,7 @@ def test_a_result_reads_back_as_it_was_written(tmp_path: Path) -> None:
     made().write(tmp_path)
     found = RunFolder(tmp_path).read(ValidateResult, "base")
     assert found == made()
-    assert found.trials["t01"].axes == {"yaw": ERROR}
+    assert found.trials["t01"].axes == {"yaw": AxisError(**ERROR)}
 
 
 def test_a_field_without_a_default_is_written_even_if_null_and_others_only_if_held() -> None:
@@ -64,12 +48,12 @@ def test_a_field_without_a_default_is_written_even_if_null_and_others_only_if_he
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, "small", None])
 def test_a_number_that_is_none_is_refused_with_its_place(value: object) -> None:
     with pytest.raises(ValidationError, match=r"axes\.yaw\.rmse"):
-        made(axes={"yaw": ERROR.model_dump() | {"rmse": value}})
+        made(ERROR | {"rmse": value})
 
 
 def test_a_field_that_is_not_declared_is_refused() -> None:
     with pytest.raises(ValidationError, match="nois_floor"):
-        made(axes={"yaw": ERROR.model_dump() | {"nois_floor": 1.0}})
+        made(ERROR | {"nois_floor": 1.0})
 
 
 @pytest.mark.parametrize(

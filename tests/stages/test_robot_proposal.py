@@ -45,15 +45,9 @@ def write_log(
     (folder / "x.toml").unlink()
     system = compile_model(Model(device))
     t = np.arange(4000) / 200.0
-    waves = ((0.7, 1.1, 0.3), (0.5, 1.7, 1.1))
-    q, qd, qdd = (
-        swings * np.column_stack([f(a, 2 * np.pi * h * 0.3, p) for a, h, p in waves])
-        for f in (
-            lambda a, w, p: a * np.sin(w * t + p),
-            lambda a, w, p: a * w * np.cos(w * t + p),
-            lambda a, w, p: -a * w * w * np.sin(w * t + p),
-        )
-    )
+    size, w = swings * np.array([0.7, 0.5]), 0.6 * np.pi * np.array([1.1, 1.7])
+    turn = np.outer(t, w) + np.array([0.3, 1.1])
+    q, qd, qdd = size * np.sin(turn), size * w * np.cos(turn), -size * w**2 * np.sin(turn)
     p = system.prior
     for axis in ("shoulder", "elbow"):
         p[system.index(f"viscous.{axis}")], p[system.index(f"coulomb.{axis}")] = 0.5, dry

@@ -109,16 +109,16 @@ second_encoder_of = "{axis}"
 """
 
 
-def recorded(root: Path, effects: dict[str, float]) -> Path:
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
     """A session of an arm whose log has positions of joints and motors."""
-    folder = root / "arm"
-    arm.record_logs(folder, 41, "ZYY", effects, style="joint_states", trials=2, seconds=8.0)
+    folder, windup = tmp_path / "arm", {"gear_windup:elbow": 1.0}
+    arm.record_logs(folder, 41, "ZYY", windup, style="joint_states", trials=2, seconds=8.0)
     write_proposal(folder, propose(to_parquet(folder)))
     return folder
 
 
-def test_wind_up_and_play_of_a_gear_are_those_of_the_truth(tmp_path: Path) -> None:
-    folder = recorded(tmp_path, {"gear_windup:elbow": 1.0})
+def test_wind_up_and_play_of_a_gear_are_those_of_the_truth(folder: Path, tmp_path: Path) -> None:
     with (folder / "session.toml").open("a") as file:
         file.write(SECOND.format(axis="elbow") + SECOND.format(axis="base_yaw"))
     bampipe.run_session(folder, runs=tmp_path / "runs", last="stiffness")
@@ -141,8 +141,7 @@ def test_wind_up_and_play_of_a_gear_are_those_of_the_truth(tmp_path: Path) -> No
     assert table.rows[0][1] == "not seen" and table.rows[1][5] == "motor"
 
 
-def test_a_second_encoder_is_of_an_axis_and_in_its_unit(tmp_path: Path) -> None:
-    folder = recorded(tmp_path, {"gear_windup:elbow": 1.0})
+def test_a_second_encoder_is_of_an_axis_and_in_its_unit(folder: Path, tmp_path: Path) -> None:
     text = (folder / "session.toml").read_text()
     for change, said in (
         (('second_encoder_of = "elbow"', 'second_encoder_of = "elbo"'), "no axis 'elbo'"),
