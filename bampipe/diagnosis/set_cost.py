@@ -392,7 +392,9 @@ class SetCosts:
             strengths = np.array(list(away.values()))
             known: Array = np.asarray(np.linalg.pinv(spread, hermitian=True), dtype=float)
             prior_sd = np.array([e.system.parameters[e.free[k]].sd for k in away])
-            own = penalise(known, prior_sd, strengths, len(shapes))
+            # What a search leaves at its prior costs a candidate nothing.
+            searched = sum(e.system.parameters[e.free[k]].searched for k in shapes)
+            own = penalise(known, prior_sd, strengths, searched)
             self._own_penalties[name] = float(own)
         return self._own_penalties[name]
 
