@@ -102,13 +102,12 @@ def _by_trial(linearisation: Linearisation, axis: int) -> tuple[float, str]:
         The share of the residual's variance that it explains, 0 to 1, and the range of its values.
     """
     e, trials = linearisation, [trial_of_block(m.trial_id) for m in linearisation.motions]
-    names = [*dict.fromkeys(trials)]
+    sums, names = e.sums, [*dict.fromkeys(trials)]
     own = [k for k, i in enumerate(e.free) if i < len(e.system.model.device.parameters)]
     moment, square = np.zeros((2, len(names), len(own)))
-    for trial, slopes, left in zip(trials, e.jacobian, e.residual, strict=True):
-        columns, row = slopes[:, axis][:, own], names.index(trial)
-        moment[row] += columns.T @ left[:, axis]
-        square[row] += np.sum(columns**2, axis=0)
+    rows = [names.index(trial) for trial in trials]
+    np.add.at(moment, rows, -sums.xy[:, axis, own])
+    np.add.at(square, rows, np.diagonal(sums.xx[:, axis], axis1=1, axis2=2)[:, own])
     p, low, high = (x[[e.free[k] for k in own]] for x in (e.p, *bounds_of(e.system)))
 
     def change(moment: Array, square: Array) -> tuple[Array, Array]:
@@ -123,7 +122,7 @@ def _by_trial(linearisation: Linearisation, axis: int) -> tuple[float, str]:
     parameter = e.system.parameters[e.free[own[best]]]
     known = square[:, best] >= _SEEN * square[:, best].max()
     values = values[known, best]
-    total = sum(float(left[:, axis] @ left[:, axis]) for left in e.residual)
+    total = float(sums.yy[:, axis].sum())
     ends = (
         f"{significant(values[k], 2)} {parameter.unit}".strip() + f" in {np.array(names)[known][k]}"
         for k in (int(np.argmin(values)), int(np.argmax(values)))

@@ -395,5 +395,5 @@ def note_clock(table: TrialTable) -> None:
 
 
 def _few(table: TrialTable, total: int) -> int:
-    """Limits on the rows that may be dropped for their time stamps."""
+    """Largest number of rows that may be dropped for their time stamps."""
     return max(3, int(table.limits.dropped_share * total))

@@ -63,8 +63,7 @@ def unwrap(table: TrialTable, encoder: Encoder) -> None:
         table.repairs.append(
             f"column '{encoder.column}' wraps {words} {in_times(len(rows))},"
             f" first at row {table.rows[rows[0]]}: unwrapped"
-            + "; a trial begun in another turn of it has another zero"
-            * far
+            + ("; a trial begun in another turn of it has another zero" if far else "")
         )
 
 
@@ -73,8 +72,8 @@ def unwrapped(
 ) -> tuple[Array, Indices, str]:
     """Readings that go on where they start anew: after full turns, or at the bits of a counter.
 
-    What fits into one turn is that around ``zero``, as of a register with a sign. Motors whose
-    protocol has room for +-12.5 rad, as that of the Mini Cheetah, start anew, too.
+    A motion within one turn of a counter is placed in the turn around ``zero``, like the value of a
+    signed register. Motors whose protocol covers +-12.5 rad (the Mini Cheetah's) wrap as well.
 
     Args:
         values: (T,) raw readings, NaN where missing.

@@ -121,7 +121,7 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
             yield stream, dialect, ()
             return
         try:
-            # Bytes of a line that broke off, as of a serial port, are no letters.
+            # A line cut off by a serial port may contain bytes that are not valid UTF-8.
             lenient = encoding == "utf-8" and not dialect.encoding
             text = stream.read().decode(encoding, "replace" if lenient else "strict")
         except UnicodeDecodeError as error:

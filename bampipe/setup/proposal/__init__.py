@@ -169,8 +169,8 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> 
         reference = max(size, key=lambda name: size[name])
         scale_sd[reference] = f", scale_sd = {robot.uncertainty}"
         return with_motors(folder, chosen, guessed, reference.removeprefix("current_"))
-    told = [size for size, tells in zip(of_motor, sure, strict=True) if tells]
-    if columns.gears and all(STATED[0] < size < STATED[1] for size in told):
+    known = [size for size, is_sure in zip(of_motor, sure, strict=True) if is_sure]
+    if columns.gears and all(STATED[0] < size < STATED[1] for size in known):
         scale_sd |= dict.fromkeys(columns.drives, _GUESSED_GEAR)
         return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
     if not columns.gears and all(size < STATED[0] for size in sizes):
