@@ -218,10 +218,10 @@ def _add_friction(d: Vocabulary, torque: Sequence[Any]) -> list[Any]:
     return other
 
 
-def _find_dry_friction(d: Vocabulary, other: Sequence[Any]) -> list[Any]:
-    """Return the part of ``other`` that changes sign with the motion, by axis."""
-    signs = [d.sgn(rate) for rate in d.qd]
-    return [(e.subs(s, -1) - e.subs(s, 1)) / 2 for e, s in zip(other, signs, strict=True)]
+def _find_dry_friction(d: Vocabulary, other: Sequence[Any]) -> list[tuple[Any, Any]]:
+    """Return `Vocabulary.dry` of the terms ``other``, one an axis."""
+    at = [[e.subs(d.sgn(v), s) for s in (-1, 0, 1)] for e, v in zip(other, d.qd, strict=True)]
+    return [((back - ahead) / 2, rest - (back + ahead) / 2) for back, rest, ahead in at]
 
 
 def _check_dependence(

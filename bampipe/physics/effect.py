@@ -119,6 +119,8 @@ class Effect(DeclaredFile):
     """Whether the effect dissipates energy for all parameters within their bounds"""
     drive: bool = False
     """Whether it applies to motors only: offered if the device has drive = true"""
+    own_dry: bool = False
+    """Whether it is offered only on axes whose dry friction is more than the base term"""
     link: Link | None = None
     """Where it acts between log and mechanism: links act in this order, each on the output of the
     previous one. Default: scale, or lever for a measurement; a torque with a link is part of the
@@ -233,7 +235,7 @@ class Effect(DeclaredFile):
                 for c in device.coordinates
                 if not self._lacks_kind(c.kind)
                 and ("brake" not in self.names or c.name in device.brakes)
-                and ("dry" not in self.names or device.has_dry_friction(c.name))
+                and (not self.own_dry or device.has_dry_friction(c.name))
             }
         if self.scope == "axis_pair":
             # Neighbouring joints where it acts on both, else axes that lie near each other.

@@ -40,7 +40,7 @@ def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
     """
     if item.effect.kind == "measurement" or earlier.effect.kind == "measurement":
         return item.effect.kind == earlier.effect.kind
-    if "dry" in item.effect.names:
+    if "dry" in item.effect.names and not (earlier.axes and {*earlier.axes}.isdisjoint(item.axes)):
         return earlier.effect.kind in ("torque", "input")
     if "pull" in item.effect.terms and earlier.effect.pulls:
         return item.effect.scope == "device" or item.target == earlier.target

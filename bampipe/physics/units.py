@@ -289,7 +289,8 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
-            symbols |= dict.fromkeys((*terms, "dry", "axis_bias", "axis_torque"), torque)
+            torques = (*terms, "dry", "dry_difference", "axis_bias", "axis_torque")
+            symbols |= dict.fromkeys(torques, torque)
             symbols |= {"qdd": unit / second**2, "axis_inertia": torque * second**2 / unit}
             symbols["viscous"] = torque * second / unit
             if axis in device.side_load:

@@ -32,8 +32,8 @@ class Vocabulary:
         channels: every input there may be; channel: their symbols.
         p, z: symbols of the parameters, and of effects' internal states.
         changes: of the states whose rate of change an expression asks for, by symbol, its symbol.
-        dry: by coordinate, the dry friction that turns with the motion; filled while torques are
-            put together, before the first effect that uses it.
+        dry: by coordinate, the mean dry friction of both directions, and half their difference;
+            filled while torques are put together, before the first effect that uses it.
         weight: by coordinate, slope of the potential energy; filled like `dry`.
         pull: by coordinate, the same less the torque of springs and the like; filled like `dry`.
         inertia: by coordinate, its entry on the diagonal of the mass matrix; filled like `dry`.
@@ -64,8 +64,8 @@ class Vocabulary:
         self.special = {"sgn": self.sgn, "ddt": self.ddt}
         self.sizes: dict[str, int] = {}
         zeros = [sp.S.Zero] * len(self.axes)
-        self.dry, self.weight, self.pull, self.inertia, self.bias = (zeros for _ in range(5))
-        self.support = self.torque = zeros
+        self.weight, self.pull, self.inertia, self.bias = (zeros for _ in range(4))
+        self.support, self.torque, self.dry = zeros, zeros, list(zip(zeros, zeros, strict=True))
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.constants = [constant_symbol(name) for name in device.constants if named_constants]
@@ -195,7 +195,8 @@ class Vocabulary:
             symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
             own = ("applied", "load", "viscous", "coulomb", "weight", "pull", "support")
             symbols |= {n: symbols[f"{n}_{a}"] for n in own}
-            symbols |= {"dry": self.dry[i], "qdd": self.qdd[i]}
+            symbols["dry"], symbols["dry_difference"] = self.dry[i]
+            symbols["qdd"] = self.qdd[i]
             symbols |= {"axis_inertia": self.inertia[i], "axis_bias": self.bias[i]}
             symbols["axis_torque"] = self.torque[i]
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
