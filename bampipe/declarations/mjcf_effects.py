@@ -144,6 +144,8 @@ def _drag(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
 
 
 def _stop(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
+    if v.settling > STEP_S:  # the damper of a tendon acts off the stop, too
+        return False
     ends = (-_FAR, v.position) if item.effect.name == "upper_stop" else (v.position, _FAR)
     w.add_tendon({item.target: 1.0}, stiffness=v.stiffness, springlength=number_list(ends))
     return True
