@@ -377,10 +377,6 @@ class BoundEffect:
             return self.axes[PAIR.index(place)]
         return place or self.target
 
-    def parameter(self, short: str) -> Parameter:
-        """Its parameter called ``short``, such as ``force``."""
-        return next(p for p in self.parameters if p.name == f"{self.prefix}.{short}")
-
 
 effect_from = Effect.from_declaration
 

@@ -163,6 +163,7 @@ def test_play_before_a_load_is_nearly_so_and_said_to_be(tmp_path: Path, bare: np
 
 def test_what_mujoco_has_no_place_for_is_listed(tmp_path: Path) -> None:
     effects = {"load_dependent_friction:elbow_2": {}, "drive_reading_delay:torque_elbow_2": {}}
+    effects["upper_stop:elbow_2"] = {"stiffness": 30.0, "settling": 0.01}
     case = Case(tmp_path / "a", effects)
     assert f"not in it: {', '.join(effects)}" in case.text
     # More presliding than there is friction has none, either.

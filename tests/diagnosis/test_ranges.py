@@ -12,7 +12,8 @@ from bampipe.physics import Model, registry
 
 def range_of(effect, parameter, scale=AXIS):
     item = Model(registry.device("slider"), [effect]).effects[0]
-    return scale.range_of(item, item.parameter(parameter))
+    (chosen,) = (p for p in item.parameters if p.name.endswith(f".{parameter}"))
+    return scale.range_of(item, chosen)
 
 
 @pytest.mark.parametrize(

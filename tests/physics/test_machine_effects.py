@@ -35,12 +35,8 @@ def test_friction_by_pose_takes_every_two_axes_from_the_middle_of_the_other():
         "yaw-pitch", "yaw-extension", "pitch-yaw", "pitch-extension", "extension-yaw",
         "extension-pitch",
     )  # fmt: skip
-    assert effect.targets(registry.device_from(ARM)) == (
-        "one-two",
-        "two-one",
-        "two-rail",
-        "rail-two",
-    )
+    pairs = effect.targets(registry.device_from(ARM))
+    assert pairs == ("one-two", "two-one", "two-rail", "rail-two")
     system = compile_model(Model(registry.device("bam"), ["friction_by_pose:yaw-extension"]))
     own = system.model.effects[0].parameters
     assert [p.unit for p in own] == ["N.m/m", "N.m.s/rad/m"]
@@ -108,12 +104,10 @@ def test_a_gear_loses_of_the_load_behind_it_without_the_rotor(stiffness):
     ("potential", "held"), [("-9*cos(joint)", False), ("0", True), ("9", True)]
 )
 def test_the_rotors_part_is_open_only_where_a_weight_or_a_spring_shows_it(potential, held):
-    effect = Model(_geared_joint(potential), ["gear_loss:joint"]).effects[0]
-    assert effect.parameter("behind").fixed is held
+    share, behind = Model(_geared_joint(potential), ["gear_loss:joint"]).effects[0].parameters
+    assert (share.fixed, behind.fixed, behind.prior) == (False, held, 1.0)
     beside = Model(_geared_joint(potential), ["gear_loss:joint", "return_spring:joint"]).effects[0]
-    assert not beside.parameter("behind").fixed
-    assert effect.parameter("behind").prior == 1.0
-    assert not effect.parameter("share").fixed
+    assert not beside.parameters[1].fixed
     # The BAM's weight is in terms of definitions.
     assert registry.device("bam").has_weight("pitch")
     assert not registry.device("bam").has_weight("yaw")
@@ -131,6 +125,18 @@ def test_hysteresis_takes_all_dry_friction_of_a_device_that_adds_some():
     one = np.array([[0.1]])
     gone = [system.required(0 * one, one, 0 * one, np.array([[z]]), u, p)[0, 0] for z in (0.0, 1.0)]
     assert gone[1] - gone[0] == pytest.approx(40.0 + 1.5 * 200.0, rel=1e-6)
+
+
+def test_all_dry_friction_of_an_axis_comes_up_gradually():
+    names = [f"{name}:carriage" for name in ("asymmetric_coulomb", "gradual_friction", "stribeck")]
+    system = compile_model(Model(registry.device("slider"), names))
+    # Coulomb 4 N, 1.5 N more forwards, Stribeck 2 N up to 0.05 m/s; all of it over 0.02 m/s.
+    p = np.array([0.0, 4.0, 1.0, 0.0, 1.5, 0.0, 1.0, 0.02, 2.0, 0.05])
+    qd = np.linspace(-0.2, 0.2, 40)[:, None]
+    empty = np.zeros((40, 0)), np.zeros((40, len(system.inputs)))
+    rising = np.tanh(qd / 0.02)
+    expected = (4.0 + 2.0 * np.exp(-((qd / 0.05) ** 2))) * rising + 1.5 * np.abs(rising)
+    assert system.required(0 * qd, qd, 0 * qd, *empty, p) == pytest.approx(expected, abs=1e-9)
 
 
 def test_behind_play_the_arm_moves_apart_from_the_drive_that_its_encoder_sees():

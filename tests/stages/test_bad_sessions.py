@@ -180,10 +180,6 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         lambda made: lambda root: (root / "session.toml").unlink(),
         "no session.toml",
     ),
-    "session file is not TOML": (
-        file("a = 1\nb = = 2\n", "session.toml"),
-        "toml, line 2: not TOML",
-    ),
     "device file is broken": (
         both(put("device", "my.toml"), file("nonsense", "my.toml")),
         "my.toml, line 1: not TOML",
@@ -197,7 +193,6 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         "no encoder for axis 'pitch'",
     ),
     "calibration missing": (drop("force.calibration_n_per_v"), "'calibration_n_per_v' is missing"),
-    "force without its columns": (drop("force.columns"), "'columns' is missing"),
     "an input of the device missing": (drop("force"), "no channel for input 'force_x'"),
     "trial folder linked out of the session": (
         lambda made: link_folder_out,
