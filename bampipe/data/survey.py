@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -60,6 +61,7 @@ class SurveyedColumn:
         unit: unit by the file, else by the name, "" if neither says.
         values: (T,) of the first log.
         by_looks: whether its name says nothing and its role is what it looks like.
+        quantity: what the file calls that of which it gives this unit.
     """
 
     name: str
@@ -68,6 +70,7 @@ class SurveyedColumn:
     unit: str
     values: np.ndarray
     by_looks: bool = False
+    quantity: str = ""
 
     @property
     def conversion(self) -> RecordedUnit | None:
@@ -152,9 +155,10 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
         raise logs.fault()
     columns, guessed = _by_looks(_with_commands(list(read)), folder)
     # The first unit of a quantity is that of the first column which looks like it.
-    units = {role_of(x, u): u for x, u in reversed(logs.beside.items()) if unit(u) is not None}
+    units = [(x, u) for x, u in reversed(logs.beside.items()) if unit(u) is not None]
+    beside: dict[str, Any] = {role_of(x, u): {"quantity": x, "unit": u} for x, u in units}
     columns = tuple(
-        replace(c, unit=units.pop(c.role), by_looks=False) if c.by_looks and c.role in units else c
+        replace(c, **beside.pop(c.role), by_looks=False) if c.by_looks and c.role in beside else c
         for c in columns
     )
     if dataset is not None:

@@ -448,6 +448,7 @@ def test_speeds_in_hertz_commands_and_one_reading_in_two_units(tmp_path):
     table = np.c_[T, Q, U, 3.0 * U].tolist()
     rows = {"force units": "kip", "displacement units": "in", "data": table}
     (tmp_path / "d/a.json").write_text(json.dumps(rows))
-    assert [c.unit for c in survey(tmp_path / "d").columns] == ["", "in", "", "kip"]
+    units, device = [c.unit for c in survey(tmp_path / "d").columns], propose(tmp_path / "d").device
+    assert units == ["", "in", "", "kip"] and "drive = true" not in device
     (tmp_path / "c.json").write_text(json.dumps({"data": [{"t": [*T, *T], "q": [*Q, *Q]}]}))
     assert set(columns_of(tmp_path / "c.json")) == {"data[0].t", "data[0].q"}

@@ -12,8 +12,7 @@ from bampipe.physics import Model, registry
 
 def range_of(effect, parameter, scale=AXIS):
     item = Model(registry.device("slider"), [effect]).effects[0]
-    (chosen,) = (p for p in item.parameters if p.name.endswith(f".{parameter}"))
-    return scale.range_of(item, chosen)
+    return next(scale.range_of(item, p) for p in item.parameters if p.name.endswith(parameter))
 
 
 @pytest.mark.parametrize(

@@ -222,7 +222,7 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
     match.geared = position.name if springs and _may_be_geared(position) else ""
     weight, on_gravity = weight_of(position, fit, linear, found, bool(match.geared))
     name = position.name.removesuffix(f" [{read.stated}]")
-    text = starter_device(name, linear, drive, fit, weight, width)
+    text = starter_device(f"{name} {position.quantity}", linear, drive, fit, weight, width)
     device = registry.device_from(tomllib.loads(text), DEVICE)
     axis = device.coordinates[0].name
     known = {axis: read, "supply": supply, device.forces[0]: driver}
