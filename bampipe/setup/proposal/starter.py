@@ -20,7 +20,7 @@ from bampipe.setup.proposal.positions import SLIDING, TURNING, in_counts
 from bampipe.setup.sentences import sentence
 
 _NAMELESS = word_set("nameless")
-_FROM_A_MOTOR, _FROM_A_SENSOR = REFERENCE_WORDS | word_set("driven"), word_set("sensed")
+_DRIVEN, _SENSED, _TORQUES = map(word_set, ("driven", "sensed", "torques"))
 _FASTEST_S = 2e-4
 """Time in which viscous friction stops the least mass that a simulation is asked to follow, s."""
 _YIELDS = 2e-3
@@ -137,10 +137,10 @@ def starter_device(
         channels = 'channels = { coil_current = "A" }\n'
         rubbed = f" - abs(coil_current)*(friction_per_ampere*sgn({qd}) + viscous_per_ampere*{qd})"
         width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
-    stated = drive.role != "force" or not _FROM_A_MOTOR.isdisjoint(words(drive.column))
-    bench = drive.coil or not SLIDING.isdisjoint(words(position))
-    # Most axes whose log names neither are driven, and the effects of drives are then candidates.
-    motor = stated or not (bench or not _FROM_A_SENSOR.isdisjoint(words(drive.column)))
+    # A torque is a motor's unless a coil brakes; most axes whose log names neither are driven.
+    said = {*words(drive.column)} - (_TORQUES if drive.coil else set())
+    benched = drive.coil or said & _SENSED or SLIDING & {*words(position)}
+    motor = drive.role != "force" or said & (_DRIVEN | REFERENCE_WORDS) or not benched
     listed, driven = " and ".join(constants), "driven" if motor else "prescribed"
     wide = 5.0 if drive.scaled else 100.0  # nobody knows yet what one of it is worth
     viscous, coulomb = (", ".join(_prior(size, wide)) for size in (found.viscous, found.coulomb))
