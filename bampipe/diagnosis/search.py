@@ -127,7 +127,7 @@ class Search(SetCosts):
         normal = np.tensordot(known.weight, xx, 1) + precision
         right = -known.weight @ (xy + xx @ b) - precision @ b
         right[:nb] += p.moment
-        free = self._free_of(all_keys, n)
+        free = p.hold(known.fixed, n)[1]
         step = free @ solve_scaled(free.T @ normal @ free, free.T @ right)
         return np.asarray(step[m:])
 

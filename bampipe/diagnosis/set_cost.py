@@ -49,6 +49,7 @@ class Solution:
         penalty: Occam factors and priors, nats.
         sizes: irreplaceable size of each effect, see `SetCosts._sizes`.
         weight: weight of the squares of each axis, (n_q,).
+        fixed: see `LinearSolution`.
     """
 
     cost: float
@@ -58,6 +59,7 @@ class Solution:
     penalty: float = 0.0
     sizes: Sequence[float] = ()
     weight: Array = field(default_factory=lambda: np.zeros(0))
+    fixed: Mapping[int, float] = field(default_factory=dict)
 
 
 class SetCosts:
@@ -244,7 +246,7 @@ class SetCosts:
             shapes = sum(len(key[1]) for key in keys)
             penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
         cost = solved.cost - float(volume.sum()) + penalty
-        return Solution(cost, strengths, b[:nb], scale, penalty, sizes, weight)
+        return Solution(cost, strengths, b[:nb], scale, penalty, sizes, weight, solved.fixed)
 
     def _sums(
         self, keys: Sequence[Key], more: Sequence[Products] = ()
@@ -423,15 +425,10 @@ class SetCosts:
         solution = self.solve(keys)
         return self._log_slopes(tuple(sorted(keys)), solution.strengths, solution.scale)
 
-    def _free_of(self, keys: Sequence[Key], n: int) -> Array:
-        """Return the directions of n unknowns that keep the effects removed by a set at zero."""
-        away = self.problem.removal(removed_effects(keys))
-        return self.problem.hold(dict.fromkeys(away, 0.0), n)[1]
-
     def gains(self, keys: Sequence[Key]) -> Array:
         """Return the fall of the cost of a set by each key of the grid, at the set's weights."""
         known, p, nb = self.solve(keys), self.problem, self.bb.shape[1]
-        all_keys, keys = keys, added_effects(tuple(sorted(keys)))
+        keys = added_effects(tuple(sorted(keys)))
         weight = known.weight
         xx, _, places = self._sums(keys)
         n = xx.shape[1]
@@ -445,10 +442,10 @@ class SetCosts:
             for i, key in zip(places, keys, strict=True):
                 if axis in (part := self._products(key)):
                     cross[i, cols] += w * (part[axis][0].T @ self.columns[axis])
-        # The gains start from the solution of the set within its bounds.
+        # The gains start from the solution of the set; a parameter at its bound stays there.
         b = np.concatenate([known.base, *known.strengths])
         moment = moment - cross.T @ b
-        free = self._free_of(all_keys, n)
+        free = p.hold(known.fixed, n)[1]
         taken = free @ solve_scaled(free.T @ normal @ free, free.T @ cross)
         widest = self.own_products.shape[2]
         numbers, widths = np.arange(widest), self.widths[:, None]

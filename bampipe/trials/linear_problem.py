@@ -321,12 +321,14 @@ class LinearSolution:
     Attributes:
         unknowns: (n,), of which the first P are the model's own combinations of parameters.
         held: which of the other unknowns are held at zero by a bound, (n - P,).
+        fixed: changes of the model's parameters that are prescribed or at a bound, by index.
         left: sum of squares by axis, (n_q,); weight: that of the squares at the solution.
         cost: negative log density, nats.
     """
 
     unknowns: Array
     held: Flags
+    fixed: Mapping[int, float]
     left: Array
     weight: Array
     cost: float
@@ -397,7 +399,7 @@ def solve_bounded(
     cost = float(independent @ (0.5 * np.log(left / p.count)))
     off = b[:nb]
     cost += p.fixed_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
-    return LinearSolution(b, held & (bound == 0.0), left, weight, cost)
+    return LinearSolution(b, held & (bound == 0.0), fixed_at, left, weight, cost)
 
 
 def solve_scaled(normal: Array, right: Array) -> Array:
