@@ -110,7 +110,7 @@ def test_an_axis_that_hardly_moves_is_said(tmp_path: Path) -> None:
 def test_an_axis_that_moves_beyond_reason_is_said(tmp_path: Path) -> None:
     """A weightless joint in degrees: with all sizes free, nothing but the travel contradicts it."""
     found = inspected(tmp_path, mistakes.scale_column("q", 180.0 / np.pi))
-    doubt = r"joint moves through .* is its position in degrees\?"
+    doubt = r"joint moves through .* see whether its position is in degrees"
     assert any(re.match(doubt, line) for line in list_setup_faults(found))
 
 
