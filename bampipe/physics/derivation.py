@@ -139,7 +139,7 @@ def _collect_terms(d: Vocabulary, inputs: ActingInputs) -> _Terms:
     for item in acting:
         effect, by_axis = item.effect, offset if item.effect.kind == "measurement" else other
         if "dry" in effect.names:
-            d.dry = _find_dry_friction(d, other)
+            _fill_dry_friction(d, other, d.axes.index(item.target))
         if effect.uses_weight:
             d.weight = [sp.diff(sum(e.potential for e in energies), q) for q in d.q]
             d.pull = [w - t for w, t in zip(d.weight, pull, strict=True)]
@@ -218,10 +218,11 @@ def _add_friction(d: Vocabulary, torque: Sequence[Any]) -> list[Any]:
     return other
 
 
-def _find_dry_friction(d: Vocabulary, other: Sequence[Any]) -> list[tuple[Any, Any]]:
-    """Return `Vocabulary.dry` of the terms ``other``, one an axis."""
-    at = [[e.subs(d.sgn(v), s) for s in (-1, 0, 1)] for e, v in zip(other, d.qd, strict=True)]
-    return [((back - ahead) / 2, rest - (back + ahead) / 2) for back, rest, ahead in at]
+def _fill_dry_friction(d: Vocabulary, other: Sequence[Any], axis: int) -> None:
+    """Fill `Vocabulary.dry` of an axis from the terms ``other``, one an axis."""
+    sign = d.sgn(d.qd[axis])
+    back, rest, ahead = (other[axis].subs(sign, s) for s in (-1, 0, 1))
+    d.dry[axis] = (back - ahead) / 2, rest - (back + ahead) / 2
 
 
 def _check_dependence(

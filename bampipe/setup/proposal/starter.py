@@ -138,9 +138,9 @@ def starter_device(
         rubbed = f" - abs(coil_current)*(friction_per_ampere*sgn({qd}) + viscous_per_ampere*{qd})"
         width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
     # A torque is a motor's unless a coil brakes; most axes whose log names neither are driven.
-    said = {*words(drive.column)} - (_TORQUES if drive.coil else set())
-    benched = drive.coil or said & _SENSED or SLIDING & {*words(position)}
-    motor = drive.role != "force" or said & (_DRIVEN | REFERENCE_WORDS) or not benched
+    drive_words = {*words(drive.column)} - (_TORQUES if drive.coil else set())
+    bench = drive.coil or drive_words & _SENSED or SLIDING & {*words(position)}
+    motor = drive.role != "force" or drive_words & (_DRIVEN | REFERENCE_WORDS) or not bench
     listed, driven = " and ".join(constants), "driven" if motor else "prescribed"
     wide = 5.0 if drive.scaled else 100.0  # nobody knows yet what one of it is worth
     viscous, coulomb = (", ".join(_prior(size, wide)) for size in (found.viscous, found.coulomb))
