@@ -13,7 +13,8 @@ from bampipe.trials.linear_problem import solve_scaled
 
 _STEP = 0.02
 """Step of the slope by a shape, as a share of the shape's range."""
-_STEP_LENGTHS = (1.0, 0.35, 0.1)
+STEP_LENGTHS = (1.0, 0.35, 0.1)
+"""Shares of a step of the linear problem of which the best is taken."""
 _LONGEST_STEP = 0.2
 """Longest step of a refinement, as a share of that range."""
 
@@ -108,7 +109,7 @@ class Search(SetCosts):
                 (name, tuple(u + share * (v - u) for u, v in zip(shape, aim, strict=True)))
                 for (name, shape), aim in pairs
             )
-            for share in _STEP_LENGTHS
+            for share in STEP_LENGTHS
         ]
 
     def _solve_with_shapes(

@@ -16,13 +16,14 @@ from bampipe.diagnosis.probability import (
     weigh_sets,
 )
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import Pool, Search
+from bampipe.diagnosis.search import STEP_LENGTHS, Pool, Search
 from bampipe.diagnosis.session import (
     Fit,
     Session,
     bounds_of,
     candidates_of,
     change_effects,
+    rms,
     system_of,
     worker_state,
     workers,
@@ -30,6 +31,8 @@ from bampipe.diagnosis.session import (
 from bampipe.diagnosis.set_cost import added_effects, effect_names, removed_effects
 from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.compare import NOTICEABLE
+from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.samples import take_samples
 
 Progress = Callable[[float, str], None]
 """Called with the fraction of the work done and a description of the current step."""
@@ -213,7 +216,7 @@ def _fit_better(
 ) -> tuple[Fit | None, dict[tuple[str, ...], FittedSet]]:
     """Fit the sets ``better`` in turn until the fit of one is better than the current model.
 
-    A set that fits held-out trials worse is not better, even if its log evidence is.
+    A set that fits held-out trials worse is no more probable, even if its log evidence is higher.
 
     Returns:
         The better fit, if any, and the fits that are not better, by effects.
@@ -234,11 +237,11 @@ def _fit_better(
         moved = fits[members]
         if moved is not None:
             gain, held_out = gains_when_fitted(current, moved, search, keys)
-            if gain <= _LEAST_GAIN:
-                rows = zip(moved.rows_beyond_bias, current.likelihood.root, strict=True)
-                kept[effect_names(keys)] = FittedSet(gain, [row * root for row, root in rows])
-            elif held_out > -NOTICEABLE:
+            if gain > _LEAST_GAIN and held_out > -NOTICEABLE:
                 return moved, kept
+            rows = zip(moved.rows_beyond_bias, current.likelihood.root, strict=True)
+            least = min(gain, _LEAST_GAIN)
+            kept[effect_names(keys)] = FittedSet(least, [row * root for row, root in rows])
         broken.append({*keys})
         if fresh:
             fits[members] = None
@@ -360,7 +363,11 @@ def change_set(spec: ModelSpec, keys: Sequence[Key]) -> ModelSpec:
 
 
 def start_of(search: Search, keys: Sequence[Key], wider: ModelSpec) -> Array:
-    """Return the parameters of a changed model from the solution of its set, (n_p,)."""
+    """Return the parameters of a changed model from the solution of its set, (n_p,).
+
+    Of steps of several lengths, that with the least residual: shapes of the model that the linear
+    problem moves far may end where the model is much worse.
+    """
     solution, known = search.solve(keys), dict[str, float]()
     for key, strength in zip(added_effects(tuple(sorted(keys))), solution.strengths, strict=True):
         item = search.dictionary.candidates[key[0]]
@@ -374,7 +381,19 @@ def start_of(search: Search, keys: Sequence[Key], wider: ModelSpec) -> Array:
         known |= {
             item.parameters[i].name: v for i, v in zip(item.linear_indices, strength, strict=False)
         }
-    return start_at(search, solution.base, known, wider)
+    starts = [start_at(search, share * solution.base, known, wider) for share in STEP_LENGTHS]
+    return min(starts, key=lambda p: _misfit(search, wider, p))
+
+
+def _misfit(search: Search, spec: ModelSpec, p: Array) -> float:
+    """Return the negative log likelihood of the trials at parameters ``p``, (n_p,), nats."""
+    e, like, system = search.dictionary.linearisation, search.problem.likelihood, system_of(spec)
+    rows = e.thin(lambda at: ModelOnTrial(system, p, [at.motion]).residual)
+    left = (take_samples(rows, here, axis) for axis, here in enumerate(like.samples))
+    cost = search.problem.independent @ [
+        np.log(max(rms(x * root), 1e-300)) for x, root in zip(left, like.root, strict=True)
+    ]
+    return float(cost) if np.isfinite(cost) else np.inf
 
 
 def start_at(search: Search, base: Array, known: Mapping[str, float], wider: ModelSpec) -> Array:

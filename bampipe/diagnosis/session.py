@@ -50,7 +50,7 @@ _COARSE_SHIFT = 0.03
 shifted: the column of the delay is its first derivative."""
 _CONVERGED = 0.2
 """A fit ends when a step promises a smaller fall of the negative log likelihood, nats."""
-_LEAST_FALL = 0.02
+_LEAST_FALL = 0.1
 """Smallest fall of it that a step must bring for another to be taken, nats."""
 _STOPPING_WIDTH = 0.125
 """Factor on the sign width of the replicate that stops; a 32nd gives the same residual."""

@@ -26,7 +26,7 @@ _LOOSE = 1e-6
 _TOGETHER = 100_000
 """Rows of columns that are weighted in one pass."""
 _RIDGE = 1e-10
-_PASSES, _REWEIGHTS = 8, 5
+_REWEIGHTS = 5
 _STEADY = 0.02
 """Relative change of the weights at convergence; the cost changes by its square."""
 
@@ -352,7 +352,8 @@ def solve_bounded(
 ) -> LinearSolution:
     """Minimise the negative log likelihood, alternating between axis weights and bounds.
 
-    An unknown that leaves its bounds is held at the bound it crossed.
+    An unknown that leaves its bounds is held at the bound it crossed, and let go once if the cost
+    falls inwards from there.
 
     Args:
         problem: the model's own columns, which come first.
@@ -364,42 +365,57 @@ def solve_bounded(
     """
     p, n = problem, xx.shape[1]
     flat = xx.reshape(len(xx), -1)
-    nb, independent = p.to_parameters.shape[1], p.independent
-    low = np.zeros(0) if low is None else low
-    high = np.zeros(0) if high is None else high
+    (n_all, nb), independent = p.to_parameters.shape, p.independent
+    lower = p.lower if low is None else np.append(p.lower, low)
+    upper = p.upper if high is None else np.append(p.upper, high)
     precision, moment = np.zeros((n, n)), np.zeros(n)
     precision[:nb, :nb], moment[:nb] = p.precision, p.moment
     precision[nb:, nb:] = 0.0 if expected is None else expected
-    fixed_at = dict(absent or {})
-    held, bound = np.zeros(n - nb, dtype=bool), np.zeros(n - nb)
+    given = absent or {}
+    # By index: parameters first, then the other unknowns.
+    fixed_at, freed = dict(given), set[int]()
     weight = independent / np.maximum(yy, 1e-300) if weight is None else weight
-    for _ in range(_PASSES):
-        fixed, free = p.hold(fixed_at, n)
-        fixed[nb:] = bound
-        chosen = free[:, np.append(np.ones(free.shape[1] - n + nb, dtype=bool), ~held)]
+    while True:
+        own = {k: value for k, value in fixed_at.items() if k < n_all}
+        others = {k - n_all: value for k, value in fixed_at.items() if k >= n_all}
+        fixed, free = p.hold(own, n)
+        fixed[nb:][[*others]] = [*others.values()]
+        chosen = np.delete(free, [k + free.shape[1] - n + nb for k in others], axis=1)
         for _ in range(_REWEIGHTS):
             normal = (weight @ flat).reshape(n, n) + precision
-            right = moment - weight @ xy - normal @ fixed
-            b = fixed + chosen @ solve_scaled(chosen.T @ normal @ chosen, chosen.T @ right)
+            right = moment - weight @ xy
+            rest = chosen.T @ (right - normal @ fixed)
+            b = fixed + chosen @ solve_scaled(chosen.T @ normal @ chosen, rest)
             left = np.maximum(yy + 2.0 * xy @ b + (xx @ b) @ b, 1e-12 * yy)
             left = left + 1e-300
             before, weight = weight, independent / left
             if np.all(np.abs(weight - before) <= _STEADY * before):
                 break
-        out = ~held & ((b[nb:] < low - 1e-12) | (b[nb:] > high + 1e-12))
-        change = p.to_parameters @ b[:nb]
+        change = np.append(p.to_parameters @ b[:nb], b[nb:])
         slack = 1e-6 * (1.0 + np.abs(change))
-        below, above = change < p.lower - slack, change > p.upper + slack
-        fresh = {*np.flatnonzero(below | above).tolist()} - {*fixed_at}
-        if not out.any() and not fresh:
+        slack[n_all:] = 1e-12
+        beyond = (change < lower - slack) | (change > upper + slack)
+        if fresh := {*np.flatnonzero(beyond).tolist()} - {*fixed_at}:
+            nearest = np.clip(change, lower, upper)
+            fixed_at |= {k: float(nearest[k]) for k in fresh}
+            continue
+        if not (bounds := {*fixed_at} - {*given} - freed):
             break
-        held |= out
-        bound[out] = np.clip(b[nb:], low, high)[out]
-        fixed_at |= {k: float(p.lower[k] if below[k] else p.upper[k]) for k in fresh}
+        # The minimum may lie at only some of the bounds that were crossed together.
+        slope = normal @ b - right
+        rise = np.append(np.zeros(n_all), slope[nb:])
+        rise[[*own]] = np.linalg.lstsq(p.to_parameters[[*own]].T, slope[:nb])[0]
+        rise = np.where(change >= upper - slack, rise, -rise)
+        inwards = {k for k in bounds if rise[k] > 0.0}
+        if not inwards:
+            break
+        freed |= inwards
+        fixed_at = {k: value for k, value in fixed_at.items() if k not in inwards}
+    held = np.array([others.get(k) == 0.0 for k in range(n - nb)], dtype=bool)
     cost = float(independent @ (0.5 * np.log(left / p.count)))
     off = b[:nb]
     cost += p.fixed_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
-    return LinearSolution(b, held & (bound == 0.0), fixed_at, left, weight, cost)
+    return LinearSolution(b, held, own, left, weight, cost)
 
 
 def solve_scaled(normal: Array, right: Array) -> Array:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 from sessions import fit_from_priors
 
 from bampipe.diagnosis.criteria import Criteria
@@ -92,16 +93,23 @@ def test_what_all_replicates_share_goes_to_the_factor_of_the_bias(fitted, share)
 
 @pytest.mark.parametrize(
     ("common", "share", "found"),
-    [(1.0, 0.8, (1.0, 0.8)), (-1.0, -0.7, (0.0, 0.0)), (4.0, 4.0, (1.5, 1.5))],
+    [
+        (1.0, 0.8, (1.0, 0.8)),
+        (-1.0, 0.7, (0.0, 0.7)),
+        (4.0, 0.7, (1.5, 0.7)),
+        (1.0, -1.0, (1.0, 0.0)),
+    ],
 )
 def test_friction_that_truly_stops_has_a_factor_of_its_own_within_bounds(
     fitted, common, share, found
 ):
     _, fit = fitted
     noise = fit.likelihood.noise
-    # Unlike anything the model's own parameters could do.
-    rng = np.random.default_rng(3)
-    stops = tuple(np.abs(b).max() * rng.normal(size=b.shape) for b in noise.bias)
+    # Unlike anything the model's own parameters could do, and the common bias.
+    rng, stops = np.random.default_rng(3), []
+    for b, root in zip(noise.bias, fit.likelihood.root, strict=True):
+        other, weight = np.abs(b).max() * rng.normal(size=b.shape), root**2 * b
+        stops.append(other - b * (weight @ other) / (weight @ b))
     like = replace(fit.likelihood, noise=replace(noise, stopping=stops))
     residual = [common * b + share * s for b, s in zip(noise.bias, stops, strict=True)]
     solved = np.transpose(factors(replace(fit, likelihood=like), residual))
@@ -151,6 +159,22 @@ def test_parameters_and_strengths_stay_within_bounds_and_the_rest_moves_along(li
     assert out.held.tolist() == [True] and out.unknowns[1] == 0.0
     inside = solve_bounded(one, xx, xy, yy, np.array([-3.0]), np.array([0.0]))
     assert inside.unknowns == pytest.approx(free.base, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_bounds_that_are_crossed_together_do_not_all_hold_at_the_minimum(seed):
+    rng = np.random.default_rng(seed)
+    base = rng.normal(size=(200, 6)) @ rng.normal(size=(6, 6))
+    y, lower, upper = (
+        rng.normal(size=200) - base @ rng.normal(size=6),
+        rng.normal(size=6) - 1.0,
+        0.5,
+    )
+    lower = np.minimum(lower, 0.0)
+    found = problem_of(y, base, lower=lower, upper=upper).solve().base
+    wanted = lsq_linear(base, -y, (lower, upper)).x
+    assert np.sum((y + base @ found) ** 2) < 1.001 * np.sum((y + base @ wanted) ** 2)
+    assert np.all((lower - 1e-5 < found) & (found < upper + 1e-5))
 
 
 def test_what_is_taken_away_changes_the_rest_unless_another_parameter_replaces_it(line):
