@@ -27,8 +27,9 @@ _SURE = 5.0
 """Standard errors beyond which the sign of a drive is certain."""
 _LEAST_LEFT = 3e-3
 """Fraction of a drive's variance below which drawings are not distinguished."""
-_CONTRADICTED = 2.0 * np.log(2.0)
-"""Penalty, in nats, of a mounting for each drive whose friction would then drive the joint."""
+_CONTRADICTED = 3.0 * np.log(2.0)
+"""Penalty, in nats, of a mounting for each drive whose friction would then drive the joint: more
+than that of a robot that hangs."""
 _MOST_LEFT = 0.05
 """Largest fraction of the drives' variance that a drawing with the right reductions leaves."""
 _TURNING = 0.02
@@ -242,10 +243,11 @@ class Comparison:
     def best_mounting(self, roughly: "Comparison", doubted: float) -> Mounting:
         """Return the mounting with which the drawing explains most of ``roughly`` the same.
 
-        It is the nominal one if that leaves less than the fraction ``doubted`` of every drive.
+        It is the nominal one if that leaves less than the fraction ``doubted`` of every drive, and
+        friction contradicts none.
         """
         nominal = self.nominal
-        if max(drive.left for drive in self.hold(nominal)) < doubted:
+        if all(d.left < doubted and not d.is_contradicted for d in self.hold(nominal)):
             return nominal
         return find_mounting(roughly.turning, nominal, roughly.misfit)
 

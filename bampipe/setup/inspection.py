@@ -276,7 +276,12 @@ def describe_evidence(
     said = "; ".join(parts or back[:3])
     if after.unexplained is not None:
         return said
-    return f"with bodies as drawn, {said or 'all drives differ by one factor'}"
+    named = join_names([system.coordinates[i] for i in axes])
+    agree = f"weight, inertia and friction of {named} agree"
+    every = len(axes) == len(system.coordinates)
+    return (
+        f"with bodies as drawn, {said or ('all drives differ by one factor' if every else agree)}"
+    )
 
 
 def _fall(axis: int, before: Plausibility, after: Plausibility) -> str:

@@ -262,6 +262,7 @@ class DrawnSearch(search.Search):
         unsure = max(compared.robot.uncertainty, _UNSURE)
         shares = np.array([drive.share if drive.is_sure else 1.0 for drive in drives])
         off = np.log(np.maximum(np.abs(shares), 1e-300)) / unsure
+        off[[drive.is_contradicted for drive in drives]] = FARTHEST
         error = np.sqrt([drive.left for drive in drives])
         objections = 0.5 * np.minimum(off**2, FARTHEST**2)
         return Plausibility(error, compared.used.mean(axis=0), self.system.prior, objections)

@@ -220,6 +220,19 @@ def test_rounding_errors_of_a_point_mass_on_its_axis_are_no_torque() -> None:
     assert all(drive.is_sure for drive in others)
 
 
+def test_a_slide_that_weighs_upwards_while_friction_brakes_it_is_mounted_otherwise() -> None:
+    """Its mass could be its drive's; fitted, the weight gave a negative one, and no word."""
+    z = {"kind": "prismatic", "mass": 3.0, "effort": 80.0, "velocity": 1.0}
+    table = {"name": "slide", "robot": {"joints": {"z": z}}}
+    robot = device_from(complete_device(table, None, "")).robot
+    t = np.arange(0.0, 8.0, 1.0 / RATE)[:, None]
+    motion = JointMotion(0.1 * np.sin(t), 0.1 * np.cos(t), -0.1 * np.sin(t))
+    drives = 3.0 * (motion.change - 9.81) + 2.0 * np.sign(motion.rate)
+    compared = Comparison(robot, (False,), [motion], drives, np.ones(1), has_offset=False)
+    tried = compared.nominal, compared.best_mounting(compared, 0.02)
+    assert [compared.hold(m)[0].is_contradicted for m in tried] == [True, False]
+
+
 @pytest.mark.parametrize(("tool", "factor"), [(1.0, None), (5.0, 5.0 * OFF[3])])
 def test_a_heavy_tool_is_no_mistake_of_units(tool: float, factor: float | None) -> None:
     search = search_in(motions(1.0, 2.0, tool=tool))
