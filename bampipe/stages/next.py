@@ -25,7 +25,7 @@ from bampipe.files import digest_content, write_json, write_text
 from bampipe.identification.sensor_noise import FilterChoice, untuned_settings
 from bampipe.next_trial.discrimination import Comparison
 from bampipe.next_trial.forecast import Forecast
-from bampipe.next_trial.plan import Goal, plan_trials, record_plan
+from bampipe.next_trial.plan import Goal, plan_trials
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Envelope, imitate_trials
 from bampipe.next_trial.ranking import (
@@ -338,7 +338,7 @@ def _plan_trials(
     if utilities:
         fitted = replace(space, with_rests=False)
         options += find_best_of_each(fitted, precision.of_motion, utilities)
-    return record_plan(forecast, goal, plan_trials(forecast, options, goal))
+    return plan_trials(forecast, options, goal)
 
 
 def _write_trajectory(
