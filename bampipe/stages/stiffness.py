@@ -231,25 +231,13 @@ def _loops_of(
     pose = np.median(q, axis=0)
     channels = {name: held[name] for name in system.inputs}
     motion = Motion(trial_id, grid.t, q, still, still, still, channels)
-    signals = Signals.of_session(system, session)
-    calibration = _find_calibration_shares(system, signals, motion, number, torque)
-    return _Loops(trial_id, pose, torque, deflection, rate, found, calibration)
-
-
-def _find_calibration_shares(
-    system: System, signals: Signals, motion: Motion, number: int, torque: Array
-) -> dict[str, float]:
-    """Return the share of a stiffness that one standard uncertainty of each source is.
-
-    ``torque`` (T,) is that on axis ``number``, as logged.
-    """
-    deflection, shares = motion.q[:, number], {}
+    signals, calibration = Signals.of_session(system, session), {}
     for name, change in calibration_changes(signals):
         moved = change.of_motion(motion, signals)
         theirs = _applied(system, moved.q, moved.inputs(system.inputs), moved.t)[:, number]
         torques = linregress(torque, theirs).slope
-        shares[name] = torques / linregress(deflection, moved.q[:, number]).slope - 1.0
-    return shares
+        calibration[name] = torques / linregress(deflection, moved.q[:, number]).slope - 1.0
+    return _Loops(trial_id, pose, torque, deflection, rate, found, calibration)
 
 
 def _applied(system: System, q: Array, u: Array, t: Array) -> Array:
