@@ -238,7 +238,7 @@ def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
     if case.limits:
         count = count_affordable(forecast.rehearsal, seconds)
         drawn = list_trajectories(forecast.rehearsal, case.limits, seconds, count)
-        return DesignSpace(forecast.rehearsal, seconds, (), drawn, is_driven=True)
+        return DesignSpace(forecast.rehearsal, seconds, (), drawn)
     free = [
         motion
         for motion in case.fitted
