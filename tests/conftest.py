@@ -189,12 +189,11 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     def call(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["bampipe", *map(str, arguments)])
         capsys.readouterr()
+        code: object = 0
         try:
             main()
         except SystemExit as stop:
             code = stop.code or 0
-        else:
-            code = 0
         printed = capsys.readouterr()
         assert isinstance(code, int)
         return code, printed.out, printed.err

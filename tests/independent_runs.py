@@ -17,9 +17,6 @@ from bampipe.files import toml_text
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.model_spec import ModelSpec
-from bampipe.progress import silent
-from bampipe.stages import filter as filter_stage
-from bampipe.stages import ingest
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 
 # Dry friction as the devices write it: a true standstill has tests of its own.
@@ -79,12 +76,7 @@ def record_trials(
     chosen = replace(SHORT[machine], **conditions)
     strengths = dict.fromkeys(effects, 1.0)
     truth = independent.record(machine, root / machine, seed, strengths, chosen)
-    to_parquet(root / machine)
-    run = RunFolder(root / "run")
-    for stage in ("ingest", "filter"):
-        run.path(stage).mkdir(parents=True)
-    ingest.execute(run, run.root, ingest.Config(session=str(root / machine)), silent)
-    filter_stage.execute(run, run.root, filter_stage.Config(), silent)
+    run = RunFolder(run_short(root / machine, root, ("ingest", "filter")).root)
     spec = ModelSpec(device_of(machine).declaration, (), ())
     trials = read_measured_trials(run, system_of(spec), every_input=True)
     return trials, spec, truth["parameters"]

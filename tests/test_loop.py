@@ -15,24 +15,19 @@ from bampipe.run.events import ignore_event
 from bampipe.run.request import Request
 
 
-def made(settings: dict[str, object]) -> dict[str, object]:
-    """The record of a step that was given ``settings``."""
-    empty: dict[str, object] = {"config": {}, "inputs": {}, "outputs": {}, "versions": {}}
-    return {**empty, "key": "0" * 64, "settings": settings, "declared_inputs": [], "code": "0" * 64,
-            "summary": {}}  # fmt: skip
-
-
 def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
     write_model(tmp_path, "base", device="slider")
     child = models.child_name("base", ("stribeck:carriage",))
     write_model(tmp_path, child, "stribeck:carriage", parent="base", device="slider")
-    stages = {
-        "identify:base": made({"model": "base", "method": "least-squares"}),
-        "validate:base": made({"model": "base", "seed": 3}),
-        "diagnose:base": made({"model": "base", "seed": 2, "without": ["quadratic_drag:carriage"]}),
-        f"validate:{child}": made({"model": child, "seed": 4}),
+    settings = {
+        "identify:base": {"model": "base", "method": "least-squares"},
+        "validate:base": {"model": "base", "seed": 3},
+        "diagnose:base": {"model": "base", "seed": 2, "without": ["quadratic_drag:carriage"]},
+        f"validate:{child}": {"model": child, "seed": 4},
     }
-    write_result(tmp_path, RunResult, schema="bampipe.run/1", stages=stages)
+    hashes = {"key": "0" * 64, "code": "0" * 64}
+    stages = {step: {**hashes, "settings": given} for step, given in settings.items()}
+    write_result(tmp_path, RunResult, stages=stages)
     given = loop.settings_of(tmp_path, "base")
     assert given == {
         "identify": {"method": "least-squares"},

@@ -138,7 +138,7 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
     try:
         with options.lock():
             models.ensure_base(root, *options.request.pipeline.base_model)
-            _write_child(root, parent, named)
+            _write_child(root, child, parent, named)
         options.run("identify", "validate", parent)
         options.run("identify", "validate", child)
     except BaseException:
@@ -149,7 +149,7 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
     return child
 
 
-def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> None:
+def _write_child(root: Path, child: str, parent: str, named: Mapping[str, Path | None]) -> None:
     """Write the child of ``parent`` with the effects ``named``, its ``model.toml`` last."""
     from bampipe.declarations.model_file import load_model
 
@@ -157,7 +157,6 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
     for effect in named:
         if effect in before.effects:
             raise InputError(f"model {parent!r} already has {effect}", where=str(root))
-    child = models.child_name(parent, tuple(named))
     effect_files = {
         path.name: path for path in (root / "models" / parent / "effects").glob("*.toml")
     }

@@ -31,7 +31,7 @@ def collect(
     roots = run_folders(runs)
     if not roots:
         raise InputError(f"no run in {runs}", remedy="start with `bampipe run 'sessions/*'`")
-    found: list[rows.SessionRows] = []
+    found = []
     skipped: list[str] = []
     for number, root in enumerate(roots):
         progress(0.6 * number / len(roots), root.name)
@@ -41,11 +41,9 @@ def collect(
             skipped.append(f"{root.name}: {error}")
     if not found:
         raise InputError(f"no run in {runs} has completed ingest", remedy=skipped[0])
-    found.sort(key=lambda one: (one.key["recorded_at"] or _EARLIEST, one.key["session_id"]))
-    tables = {
-        name: [row for one in found for row in one.tables.get(name, ())]
-        for name in lab_tables.TABLES
-    }
+    # Sessions of the same moment stay in the order of their names.
+    found.sort(key=lambda one: one["sessions"][0]["recorded_at"] or _EARLIEST)
+    tables = {name: [row for one in found for row in one[name]] for name in lab_tables.TABLES}
     content = build_trends(tables)
     if is_foreign(folder):
         raise InputError(
@@ -70,7 +68,7 @@ def collect(
         for old in (folder / "figures").glob("*.svg"):
             if old.stem not in made.figures:
                 old.unlink()
-        sessions = tuple(str(one.key["session_id"]) for one in found)
+        sessions = tuple(row["session_id"] for row in tables["sessions"])
         lab = LabResult(
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
         )

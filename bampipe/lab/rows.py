@@ -1,7 +1,7 @@
 """Rows of one run folder in the tables of the lab."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,25 +22,10 @@ _OF_MODELS = ("identify.json", "validate.json", "diagnose.json")
 """Files read from a run, and from each of its models."""
 
 
-@dataclass
-class SessionRows:
-    """Rows of one session, by table.
+def read_run(root: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return rows by table of the run folder ``root``, of all stages that have run.
 
-    Attributes:
-        key: the first columns of every row: session_id, recorded_at, device.
-        tables: rows by table.
-    """
-
-    key: dict[str, Any]
-    tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
-
-    def add(self, table: str, **columns: object) -> None:
-        """Add a row to ``table``, which keeps those of ``columns`` that it has."""
-        self.tables.setdefault(table, []).append({**self.key, **columns})
-
-
-def read_run(root: Path) -> SessionRows:
-    """Return the rows of the run folder ``root``, of all stages that have run.
+    Each begins with session_id, recorded_at and device; the table ``sessions`` has one.
 
     Raises:
         InputError: ingest has not run, or a result is damaged or was changed since it was written.
@@ -58,25 +43,30 @@ def read_run(root: Path) -> SessionRows:
             where=str(run.path(IngestResult.FILE)),
             remedy="make it again (--force)",
         ) from error
-    rows = SessionRows({"session_id": root.name, "device": session.device, "recorded_at": recorded})
+    key = {"session_id": root.name, "device": session.device, "recorded_at": recorded}
+    tables = defaultdict[str, list[dict[str, Any]]](list)
+
+    def add(table: str, **columns: object) -> None:  # a table keeps those columns that it has
+        tables[table].append({**key, **columns})
+
     nis: Mapping[str, float] = {}
     for model in made:
-        found = _add_model(run, rows, model, tuple(session.axes))
+        found = _add_model(run, add, model, tuple(session.axes))
         nis = nis or found
     if run.exists("ingest/trials.parquet"):
         frame = store.read_parquet(run.path("ingest/trials.parquet")).astype(object)
         for trial in frame.where(frame.notna(), None).to_dict("records"):
-            rows.add("quality", nis=nis.get(trial["trial_id"]), **trial)
+            add("quality", nis=nis.get(trial["trial_id"]), **trial)
     stiffness = run.find(StiffnessResult)
     for axis, entry in stiffness.axes.items() if stiffness else ():
         interval = _make_interval(entry.stiffness, entry.sd)
-        rows.add("stiffness", axis=axis, **entry.model_dump(), **interval)
+        add("stiffness", axis=axis, **entry.model_dump(), **interval)
     run_record = record.read(root)
-    states = [trial["status"] for trial in rows.tables.get("quality", ())]
+    states = [trial["status"] for trial in tables["quality"]]
     verdicts = [gate.state for gate in run_record.gates]
     counting = run.default_model()
     had, has = (models.read(root, m).effects if m in made else () for m in (BASE, counting))
-    rows.add(
+    add(
         "sessions",
         sample_rate_hz=session.sample_rate_hz,
         trials=len(states),
@@ -90,11 +80,11 @@ def read_run(root: Path) -> SessionRows:
         failures=[f"{step}: {text}" for step, text in sorted(run_record.failures.items())],
         bampipe=run_record.versions.get("bampipe"),
     )
-    return rows
+    return tables
 
 
 def _add_model(
-    run: RunFolder, rows: SessionRows, model: str, axes: tuple[str, ...]
+    run: RunFolder, add: Callable[..., None], model: str, axes: tuple[str, ...]
 ) -> Mapping[str, float]:
     """Add the rows of one model; return its consistency (NIS) by trial."""
     nis: Mapping[str, float] = {}
@@ -106,11 +96,11 @@ def _add_model(
             axis = last if last in axes else next((part for part in inner if part in axes), None)
             about = {"model": model, "parameter": name, "axis": axis, "method": identified.method}
             interval = _make_interval(found.estimate, found.sd)
-            rows.add("parameters", **about, **found.model_dump(), **interval)
+            add("parameters", **about, **found.model_dump(), **interval)
     validated = run.find(ValidateResult, model)
     for axis, error in validated.axes.items() if validated else ():
         over = error.held_out_rmse / error.noise_floor if error.noise_floor else None
-        rows.add("errors", model=model, axis=axis, error_over_floor=over, **error.model_dump())
+        add("errors", model=model, axis=axis, error_over_floor=over, **error.model_dump())
     if diagnosis := run.find(DiagnoseResult, model):
         for axis, said in diagnosis.axes.items():
             plain = said.model_dump(mode="json") | {
@@ -118,7 +108,7 @@ def _add_model(
                 "likely": said.likely,
                 "probabilities": [said.probabilities[name] for name in said.likely],
             }
-            rows.add("verdicts", model=model, axis=axis, **plain)
+            add("verdicts", model=model, axis=axis, **plain)
     return nis
 
 

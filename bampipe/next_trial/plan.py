@@ -57,47 +57,30 @@ class _Option:
         )
 
 
-@dataclass(frozen=True)
-class TrialPlan:
-    """Trials to record, in order, and the expected outcome.
+def choose_trials(
+    forecast: Forecast, ranked: Sequence[RankedDesign], goal: Goal
+) -> tuple[list[_Option], bool]:
+    """Choose trials greedily until the goal is reached, then drop or shorten superfluous ones.
 
-    Attributes:
-        confusion: chance of confusing each pair of alternatives.
-        is_enough: whether the goal is reached.
-        is_full: whether the plan has its most designs and further ones would still help.
+    Also return whether these are as many as a plan may have, so that further ones would still help.
     """
-
-    designs: tuple[Primitive, ...]
-    sd: Expected
-    confusion: dict[tuple[int, int], float]
-    is_enough: bool
-    is_full: bool
-
-
-def plan_trials(forecast: Forecast, ranked: Sequence[RankedDesign], goal: Goal) -> TrialPlan:
-    """Choose trials greedily until the goal is reached, then drop or shorten superfluous ones."""
     options = [_make_option(forecast, one) for one in ranked]
     chosen: list[_Option] = []
-    now = forecast.precision.sd
-    outcome, is_full = (Expected(now, now, now), _find_confusion(forecast, ())), False
-    is_enough = _find_distance(outcome, goal) <= 0.0
+    if _find_distance(_find_present(forecast), goal) <= 0.0:
+        return chosen, False
     # A published uncertainty may be small by chance: progress is measured from the uncertainty
     # that the trials at hand would be expected to give if they were recorded again.
     left = _find_distance(_find_outcome(forecast, chosen), goal)
-    while not (is_enough or is_full):
+    for _ in range(_MOST_DESIGNS):
         wider = ([*chosen, one] for one in options)
         distances = [_find_distance(_find_outcome(forecast, plan), goal) for plan in wider]
         best = int(np.argmin(distances))
         if 0.0 < distances[best] and distances[best] > left - _LEAST_PROGRESS:
-            break
+            return chosen, False
         chosen, left = [*chosen, options[best]], distances[best]
-        is_enough = left <= 0.0
-        is_full = not is_enough and len(chosen) == _MOST_DESIGNS
-    if is_enough:
-        chosen = _shorten_plan(forecast, chosen, goal)
-    if chosen:
-        outcome = _find_outcome(forecast, chosen)
-    return TrialPlan(tuple(one.design for one in chosen), *outcome, is_enough, is_full)
+        if left <= 0.0:
+            return _shorten_plan(forecast, chosen, goal), False
+    return chosen, True
 
 
 def _shorten_plan(forecast: Forecast, chosen: list[_Option], goal: Goal) -> list[_Option]:
@@ -138,6 +121,12 @@ _Outcome = tuple[Expected, dict[tuple[int, int], float]]
 """Standard deviations, and the chance of confusing each pair of alternatives."""
 
 
+def _find_present(forecast: Forecast) -> _Outcome:
+    """Return the present standard deviations, as published, and chances of confusion."""
+    now = forecast.precision.sd
+    return Expected(now, now, now), _find_confusion(forecast, ())
+
+
 def _find_outcome(forecast: Forecast, chosen: Sequence[_Option]) -> _Outcome:
     """Return the outcome expected with ``chosen`` trials recorded."""
     nothing = np.zeros_like(forecast.precision.information)
@@ -161,27 +150,32 @@ def _find_distance(outcome: _Outcome, goal: Goal) -> float:
     return far + sum(max(float(np.log(c / goal.confusion)), 0.0) for c in confusion.values())
 
 
-def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
-    """Return the record of a plan."""
+def plan_trials(forecast: Forecast, ranked: Sequence[RankedDesign], goal: Goal) -> Plan:
+    """Return the trials that reach the goal or come nearest to it, and their expected outcome."""
+    chosen, is_full = choose_trials(forecast, ranked, goal)
+    outcome = _find_outcome(forecast, chosen) if chosen else _find_present(forecast)
+    is_enough = _find_distance(outcome, goal) <= 0.0
+    planned = [one.design for one in chosen]
     system, seen = forecast.rehearsal.system, forecast.rehearsal.seen
-    seconds = sum(design.seconds for design in found.designs)
+    seconds = sum(design.seconds for design in planned)
     confusion: tuple[PlannedConfusion, ...] = ()
     sd: dict[str, PlannedSd] = {}
     if (comparison := forecast.comparison) is not None:
         now, names = comparison.confusions(comparison.contrasts_now), comparison.alternatives
         confusion = tuple(
             PlannedConfusion(between=(names[i].name, names[j].name), before=now[i, j], after=after)
-            for (i, j), after in found.confusion.items()
+            for (i, j), after in outcome[1].items()
         )
     else:
-        pairs = zip(forecast.tabulate_sd(found.sd).items(), goal.sd, strict=True)
+        pairs = zip(forecast.tabulate_sd(outcome[0]).items(), goal.sd, strict=True)
         sd = {name: PlannedSd.of(entry, asked=asked) for (name, entry), asked in pairs}
-    designs = {id(design): design for design in found.designs}
-    times = Counter(map(id, found.designs))
+    designs = {id(design): design for design in planned}
+    times = Counter(map(id, planned))
+    what = "uncertainties" if comparison is None else "confusion"
     return Plan(
-        sentence=_say_plan(found, seconds, "uncertainties" if comparison is None else "confusion"),
+        sentence=_say_plan(sum(one.parts for one in planned), seconds, what, is_enough, is_full),
         seconds=seconds,
-        is_enough=found.is_enough,
+        is_enough=is_enough,
         trials=tuple(
             PlannedTrial(
                 # One trial of the design: the sheet lists the number of repetitions beside it.
@@ -199,17 +193,16 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     )
 
 
-def _say_plan(found: TrialPlan, seconds: float, what: str) -> str:
-    count = sum(design.parts for design in found.designs)
+def _say_plan(count: int, seconds: float, what: str, is_enough: bool, is_full: bool) -> str:
     asked = "chance of confusing two effects is expected to fall below the limit"
     if what == "uncertainties":
         asked = "uncertainty is expected to fall below the requested limit"
     if not count:
-        if found.is_enough:
+        if is_enough:
             return "The present trials suffice: nothing needs to be recorded."
         return f"No further trial would bring the {what} nearer to the limit."
     head = f"With {'one trial' if count == 1 else f'{count} trials'}, {seconds:.0f} s in all,"
-    if found.is_enough:
+    if is_enough:
         return f"{head} every {asked}."
     again, little = "ask again once they are recorded", "more trials like these add little"
-    return f"{head} not every {asked}; {again if found.is_full else little}."
+    return f"{head} not every {asked}; {again if is_full else little}."

@@ -38,10 +38,10 @@ class DesignSpace:
     """The designs that are tried.
 
     Attributes:
-        seconds: length of each; axes: the axes that they excite.
+        seconds: length of each.
+        axes: the axes that they excite; none where drives follow the examples alone.
         examples: further designs beside the primitives.
         with_rests: whether an axis may rest at the turns; with_brakes: whether brakes may be on.
-        is_driven: whether drives follow the design, so that only the examples are tried.
     """
 
     rehearsal: Rehearsal
@@ -50,12 +50,11 @@ class DesignSpace:
     examples: Sequence[Primitive] = ()
     with_rests: bool = False
     with_brakes: bool = False
-    is_driven: bool = False
 
     def list_designs(self) -> tuple[list[Primitive], bool]:
         """Return the designs to try, and whether all of them can be afforded."""
         rehearsal, most = self.rehearsal, count_affordable(self.rehearsal, self.seconds)
-        if self.is_driven:
+        if not self.axes:
             return list(self.examples), len(self.examples) < most
         designs = list_primitives(rehearsal.seen, self.seconds, self.axes, self.with_rests)
         return [*designs[:: -(-len(designs) // most)], *self.examples], len(designs) <= most

@@ -59,7 +59,7 @@ def list_setup_faults(setup: SetupResult) -> list[str]:
     for mistake in setup.mistakes:
         either = "".join(f"; or {other.sentence}" for other in mistake.alternatives)
         found.append(f"{mistake.sentence}{either} ({mistake.evidence})")
-    return [*found, *setup.warnings]
+    return [*found, *setup.warnings, *setup.unexplained.values()]
 
 
 def find_failed_checks(

@@ -39,7 +39,7 @@ class Report:
         figures = {block.name: block.svg for block in blocks if isinstance(block, Figure)}
         titles = tuple(section.title for section in document.sections)
         html = page.render_page(document, "explore.html" if explorer else "")
-        return cls(typeset.render_pdf(document, recorded), html, explorer, figures, titles)
+        return cls(typeset.render_pdf([document], recorded), html, explorer, figures, titles)
 
     def write(self, folder: Path) -> None:
         """Write the files below ``folder``, each whole or not at all."""

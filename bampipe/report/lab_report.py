@@ -28,7 +28,6 @@ _MOST_PANELS = 12
 _MOST_NAMES = 12
 _MOST_CALLOUTS = 6
 _MOST_TRIALS = 40
-_TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
 def build_lab_report(folder: Path, pages: Mapping[str, str]) -> Report:
@@ -218,13 +217,9 @@ def _show_errors(folder: Path, trends: TrendsResult) -> Iterator[Section]:
             x = [sessions.index(session) for session in part["session_id"]]
             panel.plot(x, part["error_over_floor"], mark, ms=3.6, color=colour, label=name)
         values = frame[frame["axis"] == axis]["error_over_floor"]
-        low, high = 0.85 * min(1.0, values.min()), 1.2 * max(values.max(), 1.5)
-        panel.set_yscale("log")
-        ticks = [tick for tick in _TICKS if low <= tick]
-        panel.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-        panel.minorticks_off()
+        style.use_decades(panel, [1.0, AT_FLOOR, *values])
         _name_sessions(panel, sessions)
-        panel.set(ylim=(low, high), title=axis, ylabel="error / floor")
+        panel.set(title=axis, ylabel="error / floor")
     caption = "Error on unseen trials over the noise floor, session by session."
     text = (
         "The noise floor is the error that sensors and filters leave if the model is exactly "

@@ -29,29 +29,25 @@ def protocol_sheet(plan: Plan, session: str, model: str, by_hand: bool) -> bytes
         plan: what to record; session, model: of the plan.
         by_hand: whether a person moves the device, or else its drives.
     """
-    return typeset.render_sheet(
-        _sheet(plan, session, model, by_hand, listed, scale) for scale, listed in _VERSIONS
-    )
-
-
-def _sheet(
-    plan: Plan, session: str, model: str, by_hand: bool, listed: int, scale: float
-) -> Document:
-    """Return the sheet with at most ``listed`` parameters."""
     rows = [(f"{t.times} times" if t.times > 1 else "once", t.sentence, "") for t in plan.trials]
-    blocks: list[Block] = [
-        plan.sentence,
-        Table("Trials", " | Motion ~4 | Files ~1", rows),
-        _tabulate_uncertainties(plan, model, listed),
-        tabulate_confusion("Probability of confusion", ("now", "expected"), plan.confusion),
-    ]
-    sections = [Section.gather("The trials", blocks)]
-    if plan.trials:
-        before = (_BY_HAND if by_hand else _BY_DRIVE, *_BEFORE)
-        sections.insert(0, Section("Before each trial", (before,)))
-        sections.append(Section("After the last one", (_AFTER,)))
+    before = (_BY_HAND if by_hand else _BY_DRIVE, *_BEFORE)
     about = f"Model {model}, {format_decimals(plan.seconds, 0)} s in all"
-    return Document(f"Trials to record: {session}", about, tuple(sections), scale)
+
+    def lay_out(scale: float, listed: int) -> Document:
+        """Return the sheet with at most ``listed`` parameters."""
+        blocks: list[Block] = [
+            plan.sentence,
+            Table("Trials", " | Motion ~4 | Files ~1", rows),
+            _tabulate_uncertainties(plan, model, listed),
+            tabulate_confusion("Probability of confusion", ("now", "expected"), plan.confusion),
+        ]
+        sections = [Section.gather("The trials", blocks)]
+        if plan.trials:
+            sections.insert(0, Section("Before each trial", (before,)))
+            sections.append(Section("After the last one", (_AFTER,)))
+        return Document(f"Trials to record: {session}", about, tuple(sections), scale)
+
+    return typeset.render_pdf(lay_out(*version) for version in _VERSIONS)
 
 
 def _tabulate_uncertainties(plan: Plan, model: str, listed: int) -> Table:

@@ -31,26 +31,21 @@ _VERBATIM = ("name", "tone", "lines", "columns")
 """Fields of blocks without inline marks."""
 
 
-def render_pdf(document: Document, recorded: int) -> bytes:
-    """Return ``document`` as PDF: the same document gives the same bytes.
+def render_pdf(versions: Iterable[Document], recorded: int = 0) -> bytes:
+    """Return as PDF the first of ``versions`` that fits on one page, else the last.
+
+    The same documents give the same bytes.
 
     Args:
+        versions: of one document, the fullest first.
         recorded: seconds since 1970, the date in the file; ``SOURCE_DATE_EPOCH`` replaces it.
 
     Raises:
         InputError: ``SOURCE_DATE_EPOCH`` is set, but not to whole seconds.
     """
-    return _print(document, recorded)[0]
-
-
-def render_sheet(versions: Iterable[Document]) -> bytes:
-    """Return the first of ``versions``, the fullest first, that fits on one page, else the last.
-
-    As PDF, without a date in the file.
-    """
     printed = b""
     for document in versions:
-        printed, pages = _print(document, 0)
+        printed, pages = _print(document, recorded)
         if pages == 1:
             break
     return printed

@@ -53,5 +53,7 @@ class SetupResult(Result, file="filter/setup.json", stage="filter"):
     headline: str = Field(description="Empty if nothing is wrong")
     mistakes: tuple[SetupMistake, ...]
     warnings: Names = Field(description="Reasons to doubt results that are no mistakes")
+    unexplained: dict[str, str] = Field(default_factory=dict)
+    """What the bare device leaves unexplained, by axis; a model with effects may explain it"""
     tested: Count = Field(description="Number of set-ups compared with the stated one")
     axes: dict[str, AxisSetup] = Field(min_length=1)

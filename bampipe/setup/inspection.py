@@ -84,22 +84,23 @@ def inspect_setup(
         for axis, entry in axes.items()
         if entry.state == "hardly_moves"
     ]
+    unexplained = {}
     if held is not None and not mistakes and search.over_position is None:
-        warnings += [
-            sentence("unexplained", axis=axis, explained=100.0 * max(1.0 - left, 0.0))
+        unexplained = {
+            axis: sentence("unexplained", axis=axis, explained=100.0 * max(1.0 - left, 0.0))
             for (axis, entry), left in zip(axes.items(), held.left, strict=True)
             if entry.state == "unexplained"
-        ]
+        }
     warnings += _describe_travel(system, session, motions)
     if search.heavier is not None:
         robot = drawn_robot(system)
         warnings.append(robot.describe_mass(search.heavier.place, search.heavier.factor))
     if held is not None and search.over_position is not None:
-        warnings += [
-            sentence("over_position", axis=axis, fall=_fall(i, held, search.over_position))
+        unexplained = {
+            axis: sentence("over_position", axis=axis, fall=_fall(i, held, search.over_position))
             for i, axis in enumerate(system.coordinates)
             if search.over_position.error[i] < held.error[i] / 1.5
-        ]
+        }
     named = " ".join(mistake.sentence for mistake in mistakes)
     warnings += [
         f"{said}: the scale of all estimates depends on it"
@@ -110,6 +111,7 @@ def inspect_setup(
         headline="; ".join(mistake.sentence for mistake in mistakes),
         mistakes=mistakes,
         warnings=tuple(warnings),
+        unexplained=unexplained,
         tested=search.tested,
         axes=axes,
     )

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -99,26 +99,6 @@ class Config:
     tuning_samples: Annotated[int, Field(ge=1000)] = 120_000
 
 
-@dataclass(frozen=True)
-class _Written:
-    """Results of differentiating the trials.
-
-    Attributes:
-        levels: by axis, for each trial: errors of position, velocity and acceleration.
-        interpolated: by trial, the share of its samples that are guesses across gaps.
-        skipped: by trial, why it was not differentiated.
-    """
-
-    levels: dict[str, list[Array]]
-    interpolated: dict[str, float]
-    skipped: dict[str, str]
-
-    def median_sds(self, axis: str) -> dict[str, float]:
-        """Median errors of one axis over the trials."""
-        names = ("position_sd", "velocity_sd", "acceleration_sd")
-        return dict(zip(names, np.median(np.array(self.levels[axis]), axis=0), strict=True))
-
-
 def _list_hz(by_axis: Mapping[str, float]) -> str:
     return ", ".join(f"{axis} {hz:.1f} Hz" for axis, hz in by_axis.items())
 
@@ -147,10 +127,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         min(config.force_cutoff_hz or _FORCE_CUTOFF_HZ, _HIGHEST_CUTOFF * rate),
     )
     path = out / "filter/kinematics.parquet"
-    written = _write_motions(path, samples, ids, kinematics, progress)
+    levels, bridged, skipped = _write_motions(path, samples, ids, kinematics, progress)
     progress(0.9, "the band of motion and force")
     system = compile_model(Model(load_device(run, session.device)))
-    names = [k for k in ids if k in written.interpolated]
+    names = [k for k in ids if k in bridged]
     # The band is that of some of the trials, spread over the session.
     some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS_OF_BAND)).round())
     motions = _motions(path, [names[int(k)] for k in some], system, {})
@@ -160,7 +140,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     needed = min(_CUTOFF_OVER_BAND * widest, _HIGHEST_CUTOFF * rate)
     if not config.force_cutoff_hz and widest > LEAST_HZ and needed > kinematics.input_cutoff_hz:
         kinematics = replace(kinematics, input_cutoff_hz=needed)
-        written = _write_motions(path, samples, ids, kinematics, progress)
+        levels, bridged, skipped = _write_motions(path, samples, ids, kinematics, progress)
     progress(0.95, "disturbances")
     of_kind = set(trials.loc[trials["kind"] == MOVING[0], "trial_id"])
     free = [name for name in names if name in of_kind]
@@ -176,7 +156,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if trials.loc[trials["trial_id"].isin(free), "file"].nunique() > 1:
         offsets = find_force_offsets(system, _motions(path, free, system, dead), band, fitted)
     if offsets:
-        written = _write_motions(path, samples, ids, kinematics, progress, offsets)
+        levels, *_ = _write_motions(path, samples, ids, kinematics, progress, offsets)
     disturbances = dict(dead)
     motions = _motions(path, free, system, dead)
     for name, found in find_disturbances(system, motions, band, fitted).items():
@@ -189,16 +169,16 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         sample_rate_hz=rate,
         axes={
             axis: AxisDifferentiation.of(
-                unit=entry.unit, band=bands[axis], **written.median_sds(axis), **chosen[axis][1]
+                unit=entry.unit, band=bands[axis], **levels[axis], **chosen[axis][1]
             )
             for axis, entry in axes.items()
         },
         force=ForceFilter(derivative_cutoff_hz=kinematics.input_cutoff_hz),
-        bridged_fraction=written.interpolated,
-        skipped=written.skipped,
+        bridged_fraction=bridged,
+        skipped=skipped,
         disturbances=disturbances,
         force_offsets=offsets,
-        headline=f"{kinematics.method}, {count_noun(len(written.interpolated), 'trial')}; "
+        headline=f"{kinematics.method}, {count_noun(len(bridged), 'trial')}; "
         f"bandwidth {_list_hz({axis: one['bandwidth_hz'] for axis, (_, one) in chosen.items()})};"
         " residuals compared below "
         + _list_hz({axis: one.cutoff_hz for axis, one in bands.items()}),
@@ -206,7 +186,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.97, "the set-up")
     setup = _inspect(system, path, session, names, of_kind - held_out, bands, disturbances)
     setup.write(out)
-    notes = [f"{name}: not used: {reason}" for name, reason in written.skipped.items()]
+    notes = [f"{name}: not used: {reason}" for name, reason in skipped.items()]
     notes += [*_describe_offsets(offsets, session), *_describe_disturbances(disturbances)]
     return result.write(out) | {"setup": list_setup_faults(setup), "notes": notes}
 
@@ -246,32 +226,41 @@ def _write_motions(
     kinematics: Kinematics,
     progress: Progress,
     offsets: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
-) -> _Written:
-    """Differentiate each trial, its forces without their ``offsets``, and write all to ``path``."""
-    written = _Written({axis: [] for axis in kinematics.axes}, {}, {})
+) -> tuple[dict[str, dict[str, float]], dict[str, float], dict[str, str]]:
+    """Differentiate each trial, its forces without their ``offsets``, and write all to ``path``.
+
+    Returns, by axis, the median errors over the trials; by trial, the share of its samples that are
+    guesses across gaps; and of the others, why they were not differentiated.
+    """
+    levels: dict[str, list[Array]] = {axis: [] for axis in kinematics.axes}
+    bridged: dict[str, float] = {}
+    skipped: dict[str, str] = {}
     with ParquetAppender(path) as file:
         for number, trial_id in enumerate(ids):
             progress(0.2 + 0.7 * number / len(ids), trial_id)
             frame = read_parquet(samples, trial=trial_id).dropna()
             if short := _tell_shortness(frame):
-                written.skipped[trial_id] = short
+                skipped[trial_id] = short
                 continue
             for axis, one in kinematics.axes.items():
                 if _outruns(frame[f"q_{axis}"].to_numpy(dtype=np.float64), one.noise_sd):
-                    written.skipped[trial_id] = (
+                    skipped[trial_id] = (
                         f"{axis} moves too fast for {kinematics.rate_hz:g} samples a second: log"
                         " it at a higher rate"
                     )
-            if trial_id in written.skipped:
+            if trial_id in skipped:
                 continue
             for name, offset in offsets.get(trial_id, {}).items():
                 frame[name] -= offset
             rows, errors = _differentiate(trial_id, frame, kinematics)
             file.append(rows)
-            written.interpolated[trial_id] = float(np.mean(rows["bridged"]))
-            for axis, levels in written.levels.items():
-                levels.append(errors[axis])
-    return written
+            bridged[trial_id] = float(np.mean(rows["bridged"]))
+            for axis, own in levels.items():
+                own.append(errors[axis])
+    names = ("position_sd", "velocity_sd", "acceleration_sd")
+    medians = {a: np.median(np.array(own), axis=0) for a, own in levels.items() if own}
+    sds = {axis: dict(zip(names, found, strict=True)) for axis, found in medians.items()}
+    return sds, bridged, skipped
 
 
 def _motions(

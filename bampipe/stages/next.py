@@ -25,7 +25,7 @@ from bampipe.files import digest_content, write_json, write_text
 from bampipe.identification.sensor_noise import FilterChoice, untuned_settings
 from bampipe.next_trial.discrimination import Comparison
 from bampipe.next_trial.forecast import Forecast
-from bampipe.next_trial.plan import Goal, plan_trials, record_plan
+from bampipe.next_trial.plan import Goal, plan_trials
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Envelope, imitate_trials
 from bampipe.next_trial.ranking import (
@@ -109,10 +109,15 @@ class Config(Criteria):
 
 @dataclass(frozen=True)
 class _Case:
-    """An identified model with its parameters, its trials and diagnosis, and the request."""
+    """An identified model with its parameters, its trials and diagnosis, and the request.
+
+    ``asked`` is the purpose that was asked for, or the parameter's, if ``parameter`` is one.
+    """
 
     run: RunFolder
     config: Config
+    asked: Purpose | Literal["auto"]
+    parameter: str
     spec: ModelSpec
     system: System
     p: Array
@@ -131,12 +136,12 @@ class _Case:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Propose a trial for one identified model."""
-    case, purpose, parameter = _read_case(run, config, progress)
-    forecast = _make_forecast(case, purpose, progress)
+    case = _read_case(run, config, progress)
+    forecast = _make_forecast(case, progress)
     space = _lay_out_designs(case, forecast)
-    ranked = _rank(forecast, space, parameter, progress)
+    ranked = _rank(forecast, space, case.parameter, progress)
     progress(0.9, "forecasting their gain")
-    result = _record(case, forecast, parameter, ranked)
+    result = _record(case, forecast, ranked)
     if config.trajectory:
         result = _write_trajectory(out, case, forecast.rehearsal, ranked[0], result)
     if config.plan:
@@ -161,9 +166,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return _summary(result)
 
 
-def _read_case(
-    run: RunFolder, config: Config, progress: Progress
-) -> tuple[_Case, Purpose | Literal["auto"], str]:
+def _read_case(run: RunFolder, config: Config, progress: Progress) -> _Case:
     """Return the model with its results, and the requested purpose and parameter."""
     model = load_model(run, config.model)
     if config.trajectory:
@@ -176,9 +179,9 @@ def _read_case(
             where=f"device {model.device.name!r}",
         )
     p, found = read_estimate(run, config.model, system), run.read(IdentifyResult, config.model)
-    purpose, parameter = _split(config.purpose, list(found.parameters))
+    asked, parameter = _split(config.purpose, list(found.parameters))
     diagnosed = run.find(DiagnoseResult, config.model)
-    if diagnosed is None and purpose == "decision":
+    if diagnosed is None and asked == "decision":
         raise InputError(
             "there is no diagnosis yet, so nothing to decide is known",
             where=str(run.root),
@@ -192,13 +195,14 @@ def _read_case(
         raise InputError("no axis moves in the present trials", where=str(run.root))
     limits = read_limits(model.device, seen) if config.trajectory else {}
     spec = read_spec(run, config.model, model)
-    case = _Case(run, config, spec, system, p, found, diagnosed, session, seen, limits)
-    return case, purpose, parameter
+    return _Case(
+        run, config, asked, parameter, spec, system, p, found, diagnosed, session, seen, limits
+    )
 
 
-def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Progress) -> Forecast:
+def _make_forecast(case: _Case, progress: Progress) -> Forecast:
     """Prepare a forecast for the purpose asked for, or else for what the diagnosis left open."""
-    trials, comparison, detectability = case.session.trials, None, None
+    asked, trials, comparison, detectability = case.asked, case.session.trials, None, None
     if asked in ("auto", "decision") and case.diagnosed is not None:
         comparison = _compare_alternatives(case, case.diagnosed)
     if asked == "decision" and comparison is None:
@@ -234,7 +238,7 @@ def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
     if case.limits:
         count = count_affordable(forecast.rehearsal, seconds)
         drawn = list_trajectories(forecast.rehearsal, case.limits, seconds, count)
-        return DesignSpace(forecast.rehearsal, seconds, (), drawn, is_driven=True)
+        return DesignSpace(forecast.rehearsal, seconds, (), drawn)
     free = [
         motion
         for motion in case.fitted
@@ -274,9 +278,7 @@ def _rank(
     return rank_designs(space, utility, partial(report, 0.5))
 
 
-def _record(
-    case: _Case, forecast: Forecast, parameter: str, ranked: Sequence[RankedDesign]
-) -> NextResult:
+def _record(case: _Case, forecast: Forecast, ranked: Sequence[RankedDesign]) -> NextResult:
     """Return the proposal, its reason and its expected gain."""
     proposals = tuple(forecast.proposal(one) for one in ranked)
     table: dict[str, Detectable] = {}
@@ -292,7 +294,7 @@ def _record(
     result = NextResult(
         model=case.config.model,
         purpose=forecast.purpose,
-        parameter=parameter,
+        parameter=case.parameter,
         trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in motions)),
         sentence=proposals[0].sentence,
         why="",
@@ -338,7 +340,7 @@ def _plan_trials(
     if utilities:
         fitted = replace(space, with_rests=False)
         options += find_best_of_each(fitted, precision.of_motion, utilities)
-    return record_plan(forecast, goal, plan_trials(forecast, options, goal))
+    return plan_trials(forecast, options, goal)
 
 
 def _write_trajectory(

@@ -1,6 +1,6 @@
 """Stage validate: inverse-dynamics torque and handle force against the measured ones (Fig. 9)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 
@@ -108,14 +108,45 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         drift = find_drift(system, motions, parameters, judged)
         free = free_runs(run, system, motions, parameters, judged)
         free = free.model_copy(update={"drift": drift})
-    if system.model.device.robot is not None:
-        notes += _silent_joints(system, compared, floor)
+    device, axes = system.model.device, dict[str, JudgedError]()
+    for i, (axis, found) in enumerate(axis_errors(system, compared).items()):
+        level, scatter = (floor.level[i], floor.sd[i]) if floor else (None, 0.0)
+        axes[axis] = JudgedError.of(
+            found,
+            noise_floor=level,
+            noise_floor_sd=scatter,
+            standing=compare_with_floor(found.held_out_rmse, level, scatter),
+        )
+    if device.robot is not None:
+        notes += _silent_joints(axes, compared)
     with ParquetAppender(out / f"models/{config.model}/residuals.parquet") as file:
         for name, parts in groupby(compared, key=lambda c: trial_of_block(c.trial_id)):
             tables = [_tabulate_residuals(system, name, c) for c in parts]
             file.append(pd.concat(tables, ignore_index=True))
     describe_terms(system, trials, compared, p, estimates.covariance, config.model).write(out)
-    return _result(run, system, trials, compared, floor, free, notes, estimates).write(out)
+    used = [c.used.min(axis=1, keepdims=True) for c in compared]
+    sizes = zip(device.forces, rms((c.force_residual for c in compared), used), strict=True)
+    forces = {name: ForceError(rmse=size, unit=device.force_unit) for name, size in sizes}
+    fits = {axis: e.fit_percent for axis, e in axes.items() if e.fit_percent is not None}
+    best = ", ".join(f"{axis} {fit:.1f} %" for axis, fit in fits.items())
+    on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"
+    failed = tuple(find_failed_checks(run.read(IngestResult), estimates, axes))
+    checks = f"; {count_noun(len(failed), 'check')} failed" if failed else ""
+    return ValidateResult(
+        model=config.model,
+        axes=axes,
+        trials={
+            c.trial_id: TrialError.model_validate(axis_errors(system, [c]) | {"held_out": c.judged})
+            for c in compared
+        },
+        forces=forces,
+        free_run=free,
+        cutoff_hz=dict(zip(system.coordinates, trials.band.cutoff_hz, strict=True)),
+        floor_replays=0 if floor is None else floor.replicates,
+        failed_checks=failed,
+        notes=tuple(notes),
+        headline=f"fit on {on}: {best}{checks}",
+    ).write(out)
 
 
 def _leave_out(system: System, published: Array, estimates: IdentifyResult, trial: str) -> Array:
@@ -163,17 +194,15 @@ def _noise_floor(
     return found.noise_floor, notes
 
 
-def _silent_joints(
-    system: System, compared: Sequence[ComparedTrial], floor: NoiseFloor | None
-) -> list[str]:
+def _silent_joints(axes: Mapping[str, JudgedError], compared: Sequence[ComparedTrial]) -> list[str]:
     """Say which joints of a robot these trials do not identify, and the likely reason."""
     found = []
-    for i, (axis, entry) in enumerate(axis_errors(system, compared).items()):
+    for i, (axis, entry) in enumerate(axes.items()):
         if entry.fit_percent is None or entry.fit_percent >= SILENT_PERCENT:
             continue
         size = rms((c.measured for c in compared), (c.used for c in compared))[i]
         why = "the model lacks the effect that dominates it"
-        if floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]:
+        if entry.noise_floor is not None and entry.held_out_rmse < 2.0 * entry.noise_floor:
             why = "noise and friction mask it"
         share = max(entry.fit_percent, 0.0)
         found.append(
@@ -181,51 +210,6 @@ def _silent_joints(
             f" RMS, so these trials do not identify this joint; {why}."
         )
     return found
-
-
-def _result(
-    run: RunFolder,
-    system: System,
-    trials: MeasuredTrials,
-    compared: Sequence[ComparedTrial],
-    floor: NoiseFloor | None,
-    free_run: FreeRun | None,
-    notes: Sequence[str],
-    identified: IdentifyResult,
-) -> ValidateResult:
-    """Return the content of validate.json."""
-    axes = {}
-    for i, (axis, found) in enumerate(axis_errors(system, compared).items()):
-        level, scatter = (floor.level[i], floor.sd[i]) if floor else (None, 0.0)
-        axes[axis] = JudgedError.of(
-            found,
-            noise_floor=level,
-            noise_floor_sd=scatter,
-            standing=compare_with_floor(found.held_out_rmse, level, scatter),
-        )
-    device, used = system.model.device, [c.used.min(axis=1, keepdims=True) for c in compared]
-    sizes = zip(device.forces, rms((c.force_residual for c in compared), used), strict=True)
-    forces = {name: ForceError(rmse=size, unit=device.force_unit) for name, size in sizes}
-    fits = {axis: e.fit_percent for axis, e in axes.items() if e.fit_percent is not None}
-    best = ", ".join(f"{axis} {fit:.1f} %" for axis, fit in fits.items())
-    on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"
-    failed = tuple(find_failed_checks(run.read(IngestResult), identified, axes))
-    checks = f"; {count_noun(len(failed), 'check')} failed" if failed else ""
-    return ValidateResult(
-        model=identified.model,
-        axes=axes,
-        trials={
-            c.trial_id: TrialError.model_validate(axis_errors(system, [c]) | {"held_out": c.judged})
-            for c in compared
-        },
-        forces=forces,
-        free_run=free_run,
-        cutoff_hz=dict(zip(system.coordinates, trials.band.cutoff_hz, strict=True)),
-        floor_replays=0 if floor is None else floor.replicates,
-        failed_checks=failed,
-        notes=tuple(notes),
-        headline=f"fit on {on}: {best}{checks}",
-    )
 
 
 def _tabulate_residuals(system: System, trial_id: str, c: ComparedTrial) -> pd.DataFrame:

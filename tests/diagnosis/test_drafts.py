@@ -59,7 +59,7 @@ def detent(tmp_path_factory):
     """A run of a joint with a magnet in it, diagnosed as unknown, and the draft for it."""
     root = tmp_path_factory.mktemp("detent")
     record_trials(root, "joint", 6, "detent:joint")
-    run = RunFolder(root / "run")
+    run = RunFolder(root / "runs/joint")
     ensure_base(run.root, "", ())
     identify.execute(run, run.root, identify.Config(method="least-squares"), silent)
     write_diagnosis(run.root, "joint")

@@ -178,7 +178,7 @@ def test_stored_trials(full: Path) -> None:
 def test_the_report(full: Path) -> None:
     (full / "more").write_bytes(b"x" * 4096)
     with pytest.raises(InputError, match="no temporary files can be written"):
-        typeset.render_pdf(Document("title", "subtitle", ()), 0)
+        typeset.render_pdf([Document("title", "subtitle", ())])
 
 
 def test_no_folder_at_all(monkeypatch: pytest.MonkeyPatch) -> None:

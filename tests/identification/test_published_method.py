@@ -76,7 +76,7 @@ def test_a_filter_that_errs_more_is_published_on_request(error: float, doubts: i
 def test_a_drive_that_friction_stops_at_once_is_not_simulated(tmp_path) -> None:
     """Its friction is a hundred times its inertia: steps of a simulation would be of 0.1 us."""
     _, _, truth = record_trials(tmp_path, "drive", 99201)
-    run = RunFolder(tmp_path / "run")
+    run = RunFolder(tmp_path / "runs/drive")
     write_model(run.root, "base", device=run.read(IngestResult).device)
     identify.execute(run, run.root, identify.Config(), silent)
     found = run.read(IdentifyResult, "base")

@@ -50,7 +50,7 @@ def identified(root, **conditions) -> tuple[IdentifyResult, dict[str, float]]:
     _, _, truth = record_trials(
         root, "bam", 8602, EFFECT, trials=2, seconds=5.0, rate_hz=400.0, **conditions
     )
-    run = RunFolder(root / "run")
+    run = RunFolder(root / "runs/bam")
     write_model(run.root, "right", EFFECT)
     identify.execute(run, run.root, identify.Config(model="right", method="ukf"), silent)
     return run.read(IdentifyResult, "right"), truth

@@ -7,11 +7,11 @@ from pathlib import Path
 from made_results import diagnosis, write_model, write_result
 
 from bampipe.data import store
-from bampipe.files import write_json
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.floor import compare_with_floor
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.run import RunResult
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
 
@@ -65,8 +65,7 @@ class Made:
             effect, parameters = self.child
             name = f"base+{effect.replace(':', '.')}"
             self._model(root, name, (effect,), parameters, dict.fromkeys(AXES, 1.0))
-        record = {"schema": "bampipe.run/1", "stages": {}, "gates": [], "failures": {}}
-        write_json(root / "run.json", record)
+        write_result(root, RunResult)
         return root
 
     def _model(

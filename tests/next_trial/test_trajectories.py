@@ -2,7 +2,7 @@
 
 import io
 import json
-from dataclasses import dataclass
+from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
@@ -72,20 +72,13 @@ def rehearse(device: Device) -> Rehearsal:
     return Rehearsal(system, p, sensors, kinematics, SEEN.widen(bounds, speeds), 0)
 
 
-@dataclass(frozen=True)
-class Read:
-    """A trajectory as its file has it: (T,) and (T, 3)."""
-
-    t: np.ndarray
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-    effort: np.ndarray
+Read = namedtuple("Read", "t q qd qdd effort")
+"""A trajectory as its file has it: (T,) and (T, 3)."""
 
 
 def from_csv(text: str) -> Read:
     table = pd.read_csv(io.StringIO(text))
-    parts = ([f"{n}_{axis}" for axis in AXES] for n in ("q", "qd", "qdd", "effort"))
+    parts = ([f"{n}_{axis}" for axis in AXES] for n in Read._fields[1:])
     return Read(table["t"].to_numpy(), *(table[names].to_numpy() for names in parts))
 
 
@@ -161,8 +154,8 @@ def test_all_forms_say_the_same_and_name_the_joints_as_drawn(
     message = yaml.safe_load(points.text("yaml", names, "what to do"))
     assert message == json.loads(points.text("json", names, "what to do"))
     read = from_message(message)
-    for name in ("t", "q", "qd", "qdd", "effort"):
-        np.testing.assert_allclose(getattr(read, name), getattr(table, name), rtol=1e-8, atol=1e-9)
+    for column, same in zip(read, table, strict=True):
+        np.testing.assert_allclose(column, same, rtol=1e-8, atol=1e-9)
     store = pytest.importorskip("rosbags.typesys")
     types = store.get_typestore(store.Stores.ROS2_HUMBLE).types
     fields = types["trajectory_msgs/msg/JointTrajectoryPoint"].__dataclass_fields__

@@ -3,6 +3,7 @@
 The numbers mean nothing; files and fields are those that the stages leave.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import made_results
@@ -58,9 +59,9 @@ def write_all(root: Path) -> Path:
     return root
 
 
-def write_ingest(root: Path, trials: tuple[str, ...] = FREE) -> None:
+def write_ingest(root: Path) -> None:
     """Write what ingest leaves; one trial repaired, one set aside."""
-    rows = [_trial(name, "free") for name in trials]
+    rows = [_trial(name, "free") for name in FREE]
     rows[-1] |= {"status": "repaired", "repairs": "12 samples missing at 3.2 s: interpolated"}
     aside = {"status": "set_aside", "reason": "force_x frozen"}
     aside |= {"n_samples": 0, "duration_s": np.nan, "sample_rate_hz": np.nan}
@@ -105,13 +106,9 @@ def motion(number: int) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _by_trial(frame_of: object) -> pd.DataFrame:
-    parts = []
-    for number, name in enumerate(FREE):
-        frame = frame_of(number)  # type: ignore[operator]
-        frame.insert(0, "trial_id", name)
-        parts.append(frame)
-    return pd.concat(parts, ignore_index=True)
+def _by_trial(frame_of: Callable[[int], pd.DataFrame]) -> pd.DataFrame:
+    frames = {name: frame_of(number) for number, name in enumerate(FREE)}
+    return pd.concat(frames, names=["trial_id"]).reset_index(level=0).reset_index(drop=True)
 
 
 def write_filter(root: Path) -> None:
@@ -419,8 +416,4 @@ def write_record(root: Path) -> None:
         }
         for number, name in enumerate(order)
     }  # fmt: skip
-    timings = {
-        name: {"started_at": "2026-11-21T07:00:00+00:00", "seconds": 1.25 + number}
-        for number, name in enumerate(stages)
-    }
-    write_result(root, RunResult, stages=stages, timings=timings)
+    write_result(root, RunResult, stages=stages)

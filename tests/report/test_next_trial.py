@@ -4,6 +4,7 @@ import re
 from types import SimpleNamespace
 
 import pytest
+from made_results import filled
 
 from bampipe.report import protocol
 from bampipe.report.document import Callout, Table
@@ -11,41 +12,26 @@ from bampipe.report.protocol import protocol_sheet
 from bampipe.report.sections import diagnosis, next_trial
 from bampipe.results.next import ExpectedSd, NextResult, Plan
 
-MOVE = {"low": -0.4, "high": 0.4, "slow": 0.02, "fast": 0.1, "unit": "rad"}
 SENTENCE = "Move yaw slowly back and forth between −23° and 23°, for 20 s."
-FOUND = {
-    "model": "base",
-    "purpose": "sensitivity",
-    "trials": ["t01", "t02"],
-    "sentence": SENTENCE,
-    "why": "These trials would not have shown stribeck:yaw below 2 N.m.",
-    "expected": "It would show stribeck:yaw from 0.5 N.m on with 90 % probability.",
-    "proposals": [
-        {
-            "sentence": SENTENCE,
-            "seconds": 20.0,
-            "moves": {"yaw": MOVE},
-            "pose": {"pitch": 0.0},
-            "worth": 1.0,
-            "information_gain": 0.4,
-            "sd": {
-                "coulomb.yaw": {
-                    "before": 0.01, "after": 0.005, "low": 0.0042, "high": 0.006, "unit": "N.m"
-                }
+SD = {"before": 0.01, "after": 0.005, "low": 0.0042, "high": 0.006, "unit": "N.m"}
+FOUND = filled(
+    NextResult,
+    {
+        "purpose": "sensitivity",
+        "sentence": SENTENCE,
+        "why": "These trials would not have shown stribeck:yaw below 2 N.m.",
+        "proposals": [{"sd": {"coulomb.yaw": SD}}],
+        "sensitivity": {
+            "stribeck:yaw": {
+                "parameter": "stribeck.yaw.force", "smallest": 2.0, "unit": "N.m", "axis": "yaw",
+                "with_proposal": 0.5,
             },
-        }
-    ],
-    "sensitivity": {
-        "stribeck:yaw": {
-            "parameter": "stribeck.yaw.force", "smallest": 2.0, "typical": 1.0, "unit": "N.m",
-            "axis": "yaw", "with_proposal": 0.5,
-        },
-        "force_bias:x": {
-            "parameter": "force_bias.x.bias", "smallest": None, "typical": 1.0, "unit": "N",
-            "axis": "",
+            "force_bias:x": {
+                "parameter": "force_bias.x.bias", "smallest": None, "unit": "N", "axis": "",
+            },
         },
     },
-}  # fmt: skip
+)  # fmt: skip
 
 
 def results_with(found: NextResult | None) -> SimpleNamespace:
@@ -76,26 +62,22 @@ def test_the_section_says_what_to_do_where_somebody_asked():
     )
     without = diagnosis._tell_sensitivity(results_with(None), "base")
     assert "`bampipe next s01` computes" in without
-    entry = FOUND["proposals"][0]["sd"]["coulomb.yaw"] | {"low": 0.002, "high": 0.009}
-    table = next_trial.tabulate_sds("Expected", {"coulomb.yaw": ExpectedSd.model_validate(entry)})
+    entry = ExpectedSd.model_validate(SD | {"low": 0.002, "high": 0.009})
+    table = next_trial.tabulate_sds("Expected", {"coulomb.yaw": entry})
     assert table.rows == (("`coulomb.yaw`", "0.010", "0.0020 to 0.0090", "N·m"),)
     assert "eight of ten" in table.note
 
 
 def made_plan(trials: int = 1, sentence: str = SENTENCE, parameters: int = 1) -> Plan:
-    sd = {
-        "before": 0.01, "after": 0.004, "low": 0.0035, "high": 0.005, "asked": 0.005, "unit": "N.m"
-    }  # fmt: skip
-    trial = {"sentence": sentence, "seconds": 20.0, "times": 3, "moves": {"yaw": MOVE}}
-    return Plan.model_validate(
-        {
-            "sentence": "With 3 trials, 60 s in all, what is asked is expected to be reached.",
-            "seconds": 60.0 * trials,
-            "is_enough": True,
-            "trials": [trial] * trials,
-            "sd": {f"coulomb.joint_{k}": {**sd, "after": 0.004 + k} for k in range(parameters)},
-        }
-    )
+    content = {
+        "sentence": "With 3 trials, 60 s in all, what is asked is expected to be reached.",
+        "trials": [{"sentence": sentence, "times": 3}] * trials,
+        "sd": {
+            f"coulomb.joint_{k}": SD | {"asked": 0.005, "after": 0.004 + k}
+            for k in range(parameters)
+        },
+    }
+    return Plan.model_validate(filled(Plan, content))
 
 
 @pytest.mark.parametrize(("trials", "parameters"), [(0, 70), (1, 70), (8, 8), (8, 70)])

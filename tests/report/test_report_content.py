@@ -17,11 +17,13 @@ from bampipe.data.store import write_parquet
 from bampipe.errors import InputError
 from bampipe.report import style, typeset
 from bampipe.report.build import Report, build_run_report
+from bampipe.report.document import Callout
 from bampipe.report.run_results import Results
-from bampipe.report.sections import identification, validation
+from bampipe.report.sections import identification, summary, validation
 from bampipe.report.wording import break_lines, name_parameter
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult
+from bampipe.results.setup import SetupResult
 from bampipe.results.validate import ValidateResult
 
 
@@ -85,6 +87,20 @@ def test_sections_stand_in_order_and_the_summary_gives_the_key_numbers(full: Rep
     assert row_of(full.html, "t04_free")[2:] == ["–", "–", "set aside", "force_x frozen"]
     assert row_of(full.html, "t03_free")[-2] == "repaired"
     assert "interpolated" in row_of(full.html, "t03_free")[-1]
+
+
+@pytest.mark.parametrize(("model", "left"), [(synthetic_run.CHILD, ""), ("base", " Left on yaw.")])
+def test_what_the_shown_model_explains_is_no_doubt_of_the_set_up(
+    own_run: Path, model: str, left: str
+) -> None:
+    about = {axis: f"Left on {axis}" for axis in ("yaw", "pitch")}
+    given = {"warnings": ["Yaw hardly moves"], "unexplained": about, "axes": {"yaw": {}}}
+    write_result(own_run, SetupResult, **given)
+    said = Callout("note", "Doubtful set-up", f"Yaw hardly moves.{left}")
+    assert next(summary.list_blocks(Results(own_run, model))) == said
+    (own_run / f"models/{model}/validate.json").unlink()
+    said = Callout("note", "Doubtful set-up", "Yaw hardly moves. Left on yaw. Left on pitch.")
+    assert next(summary.list_blocks(Results(own_run, model))) == said
 
 
 def test_parameters_and_errors_are_the_stored_ones_rounded(full: Report) -> None:

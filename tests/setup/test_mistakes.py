@@ -176,7 +176,7 @@ def test_trials_with_a_sign_of_their_own_are_named_and_taken_in(
 def test_what_hardly_follows_the_force_is_not_called_sound(tmp_path: Path) -> None:
     found = inspected(tmp_path, mistakes.hold_even, machine="axis")
     assert found.axes["carriage"].state == "unexplained"
-    (line,) = list_setup_faults(found)
+    assert list_setup_faults(found) == [line := found.unexplained["carriage"]]
     assert line.startswith("carriage: the bare device explains")
 
 
@@ -186,7 +186,7 @@ def test_gravity_that_the_device_lacks_is_no_exchanged_column(tmp_path: Path) ->
     no_moments = set_text(r"moment\w* = .*\n", "", "joint.toml")
     found = inspected(tmp_path, weightless, no_moments)
     assert found.mistakes == ()
-    (line,) = list_setup_faults(found)
+    assert list_setup_faults(found) == [line := found.unexplained["joint"]]
     assert line.startswith("a torque that follows the position of joint")
 
 

@@ -1,4 +1,4 @@
-"""Run folders up to the filter stage, simulated or recorded."""
+"""Run folders up to the filter stage or the identification, simulated or recorded."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +12,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
 from bampipe.stages import filter as filter_stage
-from bampipe.stages import ingest
+from bampipe.stages import identify, ingest
 from bampipe.trials.motion import Motion
 from bampipe.trials.replicates import follow_motion, read_by_sensors
 from bampipe.trials.sensors import Sensors
@@ -23,6 +23,7 @@ AXES = {
     axis: {"unit": "m" if axis == "extension" else "rad", "resolution": step}
     for axis, step in RESOLUTION.items()
 }
+SQUARES = identify.Config(method="least-squares")
 TRUTH = {
     "viscous.yaw": 4.2, "coulomb.yaw": 1.05, "viscous.pitch": 3.6, "coulomb.pitch": 2.2,
     "viscous.extension": 13.0, "coulomb.extension": 3.5, "mass": 3.5,
@@ -73,6 +74,12 @@ def recorded_run(root: Path, session: Path) -> RunFolder:
     run = RunFolder(root)
     ingest.execute(run, root, ingest.Config(session=str(session)), silent)
     return _filtered(run)
+
+
+def identified(run: RunFolder) -> RunFolder:
+    """Identify by least squares, which is quick."""
+    identify.execute(run, run.root, SQUARES, silent)
+    return run
 
 
 def _filtered(run: RunFolder) -> RunFolder:

@@ -86,15 +86,14 @@ def locked_trial(axis: str = "yaw", seed: int = 9, seconds: float = 2.0) -> dict
     return table
 
 
-def csv_text(table: dict[str, np.ndarray], columns: tuple[str, ...] | None = None) -> str:
+def csv_text(table: dict[str, np.ndarray]) -> str:
     """The CSV that a logger writes: whole counts, volts with six decimals."""
-    columns = columns or tuple(table)
     formats = [
         "%.4f" if name.startswith("brake") else "%.6f" if name.startswith("force") else "%.0f"
-        for name in columns
+        for name in table
     ]
-    lines = [",".join(columns)]
-    for row in zip(*(table[name] for name in columns), strict=True):
+    lines = [",".join(table)]
+    for row in zip(*table.values(), strict=True):
         cells = ["" if np.isnan(v) else f % v for f, v in zip(formats, row, strict=True)]
         lines.append(",".join(cells))
     return "\n".join(lines) + "\n"

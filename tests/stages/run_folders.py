@@ -33,13 +33,9 @@ def write_ingested(
         }
         for name, frame in frames.items()
     ]  # fmt: skip
-    parts = []
-    for name, frame in frames.items():
-        part = frame.copy()
-        part.insert(0, "trial_id", name)
-        parts.append(part)
+    samples = pd.concat(frames, names=["trial_id"]).reset_index(level=0).reset_index(drop=True)
     write_parquet(root / "ingest/trials.parquet", pd.DataFrame(rows))
-    write_parquet(root / "ingest/samples.parquet", pd.concat(parts, ignore_index=True))
+    write_parquet(root / "ingest/samples.parquet", samples)
     forces = registry.device(device).forces
     encoders = {
         axis: {

@@ -172,6 +172,12 @@ def link_folder_out(root: Path) -> None:
     (root / "trials").symlink_to(root.parent / "elsewhere")
 
 
+WITHOUT_PITCH = both(
+    drop("encoders.pitch"),
+    put("brakes.columns", ["brake_yaw", "brake_extension"]),
+    put("brakes.unit", "N.m, N"),
+)
+VISCOUS = both(put("trials.0.kind", "viscous"), put("trials.0.viscous_n_s_per_m", 40))
 FIELDS = tomllib.loads(Path(__file__).with_name("refused_fields.toml").read_text())
 # name: (damage, what the one line must say)
 REFUSED: dict[str, tuple[Damage, str]] = {
@@ -184,14 +190,7 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         both(put("device", "my.toml"), file("nonsense", "my.toml")),
         "my.toml, line 1: not TOML",
     ),
-    "axis missing": (
-        both(
-            drop("encoders.pitch"),
-            put("brakes.columns", ["brake_yaw", "brake_extension"]),
-            put("brakes.unit", "N.m, N"),
-        ),
-        "no encoder for axis 'pitch'",
-    ),
+    "axis missing": (WITHOUT_PITCH, "no encoder for axis 'pitch'"),
     "calibration missing": (drop("force.calibration_n_per_v"), "'calibration_n_per_v' is missing"),
     "an input of the device missing": (drop("force"), "no channel for input 'force_x'"),
     "trial folder linked out of the session": (
@@ -290,13 +289,11 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         "declared free, but .* commanded up to 50 N.m",
     ),
     "viscous trial without brakes": (
-        both(put("trials.0.kind", "viscous"), put("trials.0.viscous_n_s_per_m", 40)),
+        VISCOUS,
         "declared viscous, but no brake is ever commanded",
     ),
     "viscous trial whose brakes were not recorded": (
-        both(
-            put("trials.0.kind", "viscous"), put("trials.0.viscous_n_s_per_m", 40), drop("brakes")
-        ),
+        both(VISCOUS, drop("brakes")),
         "declared viscous, but no brake command is recorded",
     ),
     "locked trial that moves": (
@@ -435,12 +432,7 @@ def test_a_byte_order_mark_hides_no_change(tmp_path: Path, command: Command) -> 
 
 
 def test_all_that_is_wrong_is_said_at_once_and_each_reason_once(tmp_path):
-    for_its_device = both(
-        drop("encoders.pitch"),
-        put("brakes.columns", ["brake_yaw", "brake_extension"]),
-        put("brakes.unit", "N.m, N"),
-        put("force.components", ["x", "y", "q"]),
-    )
+    for_its_device = both(WITHOUT_PITCH, put("force.components", ["x", "y", "q"]))
 
     def every_trial(made):
         made.files.update({"trials/t01.csv": "", "trials/t02.parquet": b"\xfe\xff"})

@@ -17,12 +17,13 @@ from bampipe.results.validate import ValidateResult
 from bampipe.stages import compare
 
 
-def add(root: Path, name: str, parent: str, **errors: float) -> None:
-    """A model version with these held-out errors by axis."""
+def add(root: Path, name: str, parent: str, floor: float | None = None, **errors: float) -> None:
+    """A model version with these held-out errors by axis, over this noise floor."""
     effects = tuple(part.replace(".", ":") for part in name.split("+")[1:])
     write_model(root, name, *effects, parent=parent)
     write_result(root, IdentifyResult, model=name, parameters={})
-    axes = {axis: {"held_out_rmse": error, "unit": "N.m"} for axis, error in errors.items()}
+    known = {"noise_floor": floor, "unit": "N.m"}
+    axes = {axis: {"held_out_rmse": error, **known} for axis, error in errors.items()}
     write_result(root, ValidateResult, model=name, axes=axes)
 
 
@@ -62,11 +63,7 @@ def test_a_child_that_is_no_better_does_not_count(tmp_path: Path, errors: dict[s
 
 def test_a_child_whose_floor_is_lost_does_not_count(tmp_path: Path) -> None:
     for name, parent, error, floor in (("base", "", 0.5, 0.1), ("base+a.yaw", "base", 0.05, None)):
-        add(tmp_path, name, parent, yaw=error)
-        path = tmp_path / ValidateResult.file(name)
-        content = ValidateResult.read(path)
-        axis = content.axes["yaw"].model_copy(update={"noise_floor": floor})
-        path.write_text(content.model_copy(update={"axes": {"yaw": axis}}).model_dump_json())
+        add(tmp_path, name, parent, floor, yaw=error)
     found = compared(tmp_path)
     assert [rung.confirmed for rung in found.ladder] == [True, False]
     assert found.best == "base"

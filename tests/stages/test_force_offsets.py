@@ -60,16 +60,15 @@ def test_offsets_by_trial_are_found_and_taken_off(tmp_path: Path, hold_out: bool
     assert f"t1 {OFFSETS[1] - np.mean(fitted):+.2g}"[:6] in note and " N) were subtracted" in note
 
 
-def test_one_offset_for_all_is_left_to_the_model(tmp_path: Path):
-    for number in range(4):
-        write_trial(tmp_path / f"t{number}.parquet", number, 2.0)
-    assert filtered(tmp_path, tmp_path / "out")[0]["force_offsets"] == {}
-
-
-def test_trials_that_each_go_one_way_tell_no_offset(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("offset", "speeds"), [(2.0, (0.0, 0.0, 0.0, 0.0)), (0.8, (0.5, -0.5, 0.9, -0.9))]
+)
+def test_one_offset_for_all_or_for_each_way_is_left_to_the_model(
+    tmp_path: Path, offset: float, speeds: tuple[float, ...]
+):
     """What friction differs by direction would pass for it."""
-    for number, ways in enumerate((0.5, -0.5, 0.9, -0.9)):
-        write_trial(tmp_path / f"t{number}.parquet", number, 0.8 * np.sign(ways), ways)
+    for number, ways in enumerate(speeds):
+        write_trial(tmp_path / f"t{number}.parquet", number, np.copysign(offset, ways), ways)
     assert filtered(tmp_path, tmp_path / "out")[0]["force_offsets"] == {}
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import schema_misfits
-from identified_run import recorded_run, simulated_run
+from identified_run import SQUARES, identified, recorded_run, simulated_run
 from made_results import write_model
 
 from bampipe.data.run_folder import RunFolder
@@ -21,14 +21,6 @@ from bampipe.simulator import simulated_session as simulation
 from bampipe.stages import identify, validate
 from bampipe.trials.measured import read_measured_trials
 from bampipe.trials.reading import free_trials
-
-SQUARES = identify.Config(method="least-squares")
-
-
-def identified(run: RunFolder) -> RunFolder:
-    """Identify by least squares, which is quick."""
-    identify.execute(run, run.root, SQUARES, silent)
-    return run
 
 
 @pytest.fixture(scope="module")

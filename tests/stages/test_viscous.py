@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from identified_run import recorded_run
+from identified_run import identified, recorded_run
 from independent_runs import record_run
 
 from bampipe.data.run_folder import RunFolder
@@ -19,16 +19,7 @@ from bampipe.physics.viscous_field import viscous_field
 from bampipe.progress import silent
 from bampipe.run.state import configure
 from bampipe.simulator import simulated_session as simulation
-from bampipe.stages import identify, performance, viscous
-
-SQUARES = identify.Config(method="least-squares")
-
-
-def identified(root: Path, session: Path) -> RunFolder:
-    """Take a session up to its identification, by least squares, which is quick."""
-    run = recorded_run(root, session)
-    identify.execute(run, root, SQUARES, silent)
-    return run
+from bampipe.stages import performance, viscous
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +28,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunFolder]:
     days = {"trials": 2, "viscous_trials": 2, "duration": 10.0}
     config = simulation.Config(seed=31, file_format="parquet", **days)
     simulation.simulate_session(folder / "session", config)
-    yield identified(folder / "run", folder / "session")
+    yield identified(recorded_run(folder / "run", folder / "session"))
 
 
 def found(run: RunFolder, config: viscous.Config | None = None) -> dict:

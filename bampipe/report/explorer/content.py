@@ -48,17 +48,8 @@ class _Session:
         return frame.assign(trial_id=self.prefix + frame["trial_id"]) if self.prefix else frame
 
 
-@dataclass(frozen=True)
-class _Version:
-    """One model of one session; ``label``: its short name on the page."""
-
-    session: _Session
-    model: str
-    label: str
-
-    def table(self, name: str) -> pd.DataFrame | None:
-        """Return a Parquet file of the model, as `_Session.table` does."""
-        return self.session.table(self.session.results.model_file(name, self.model))
+_Version = tuple[_Session, str]
+"""One model of one session."""
 
 
 def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
@@ -76,11 +67,7 @@ def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
             )
     alone = len(sessions) == 1
     shown = [_Session(one, "" if alone else f"{one.session.session_id} ") for one in sessions]
-    versions = [
-        _Version(one, model, one.prefix + (f"version {k}" if k else model))
-        for one in shown
-        for k, model in enumerate(one.results.models)
-    ]
+    versions = [(one, model) for one in shown for model in one.results.models]
     spans = _place_trials(shown)
     grids = _Grids(spans, packer)
     _add_residuals(results, versions, grids)
@@ -90,7 +77,7 @@ def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
         {"name": a, "noun": results.name_force(a), "unit": format_unit(results.force_unit(a))}
         for a in results.axes
     ]
-    models = [_describe_model(version) for version in versions]
+    models = [_describe_model(*version) for version in versions]
     names = {name for one in models if one["identify"] for name in one["identify"]["parameters"]}
     tables = map(_make_trials, shown)
     path = results.root / "ingest/device.toml"
@@ -174,10 +161,10 @@ class _Grids:
 
 
 def _add_residuals(results: Results, versions: Sequence[_Version], grids: _Grids) -> None:
-    frames = [version.table("residuals.parquet") for version in versions]
+    frames = [one.table(f"models/{model}/residuals.parquet") for one, model in versions]
     # What was measured is the same in every version of a session.
-    first = {v.session.prefix: f for v, f in reversed([*zip(versions, frames, strict=True)])}
-    measured = _join(first[prefix] for prefix in dict.fromkeys(v.session.prefix for v in versions))
+    first = {v[0].prefix: f for v, f in reversed([*zip(versions, frames, strict=True)])}
+    measured = _join(first[prefix] for prefix in dict.fromkeys(one.prefix for one, _ in versions))
     if measured is None:
         return
     rows = grids.start("residuals", measured)
@@ -201,8 +188,8 @@ def _add_map_variables(results: Results, versions: Sequence[_Version], grids: _G
     if "residuals" not in grids.described:
         return
     found: dict[str, pd.Series] = {}
-    for version in versions:
-        frame = version.table("map_variables.parquet")
+    for session, model in versions:
+        frame = session.table(f"models/{model}/map_variables.parquet")
         rows = None if frame is None else grids.align("residuals", frame)
         if rows is None:
             continue
@@ -246,15 +233,16 @@ def _add_recorded(sessions: Sequence[_Session], grids: _Grids) -> None:
             grids.add("motion", rows[f"qd_{axis}"], role="motion", **about)
 
 
-def _describe_model(version: _Version) -> Content:
+def _describe_model(session: _Session, name: str) -> Content:
     """Return what the page shows of a model: of its records, the fields that the scripts read."""
-    results, name = version.session.results, version.model
+    results = session.results
+    number = results.models.index(name)
     compared = results.read(CompareResult)
     added = [rung.added for rung in (compared.ladder if compared else ()) if rung.model == name]
     described: Content = {
-        "name": version.session.prefix + name,
-        "label": version.label,
-        "prefix": version.session.prefix,
+        "name": session.prefix + name,
+        "label": session.prefix + (f"version {number}" if number else name),
+        "prefix": session.prefix,
         "added": (added and added[0]) or "",
     }
     for kind, fields in _SHOWN.items():

@@ -1,7 +1,6 @@
 """Effects: a description of each one found, its curve, errors before and after, alternatives."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -92,26 +91,26 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator
     if term.curves and not curves:
         yield "No curve is drawn: no single variable accounts for a fifth of its force."
     found = _find_window(results, term)
-    if found is None or found.added in shown:
+    if found is None or found[1] in shown:
         yield from _draw_contribution(name, term, curves)
         return
-    shown.add(found.added)
-    first = next((curve for curve in curves if curve.axis == found.window.axis), None)
+    window, added, stretches = found
+    shown.add(added)
+    first = next((curve for curve in curves if curve.axis == window.axis), None)
     if first is None:
         figure, (top, bottom) = style.make_grid(2, 1, 1.35, extra=0.0)
     else:
         figure, (left, top, bottom) = style.split_figure(2.7)
         _draw_curve(left, first)
-    unit = format_unit(results.force_unit(found.window.axis))
-    errors = _draw_window(top, bottom, found, unit)
+    unit = format_unit(results.force_unit(window.axis))
+    errors = _draw_window(top, bottom, window, stretches, unit)
     before, after = (format_digits(error, 2) for error in errors)
     change = f"the residual does not fall ({before} and {after} {unit} RMSE)"
     if errors[1] < errors[0]:
         change = f"the residual falls from {before} to {after} {unit} (RMSE)"
     beside = f"Left: {_describe_curves(term, [first])} Right: the" if first else "The"
     caption = (
-        f"{beside} worst window of {found.window.axis} without {found.added} "
-        f"({found.window.doing}), where {change}."
+        f"{beside} worst window of {window.axis} without {added} ({window.doing}), where {change}."
     )
     yield style.finish(figure, name, caption, [top])
     others = [curve for curve in curves if curve is not first]
@@ -132,18 +131,13 @@ def _describe_curves(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
     )
 
 
-@dataclass(frozen=True)
-class _Window:
-    """The worst window before effects were ``added``: residuals without and with them."""
+def _find_window(
+    results: Results, term: ModelTerm
+) -> tuple[WorstWindow, str, list[pd.DataFrame]] | None:
+    """Return the worst window of the version before the one that added the effect.
 
-    window: WorstWindow
-    added: str
-    before: pd.DataFrame
-    after: pd.DataFrame
-
-
-def _find_window(results: Results, term: ModelTerm) -> _Window | None:
-    """Return the worst window of the version before the one that added the effect."""
+    With it, the effects that were added, and the residuals without and with them.
+    """
     compared = results.read(CompareResult)
     rungs = compared.ladder if compared else ()
     rung = next((one for one in rungs if term.name in (one.added or "").split(", ")), None)
@@ -154,23 +148,21 @@ def _find_window(results: Results, term: ModelTerm) -> _Window | None:
     windows = (w for axis in axes for w in diagnosis.worst_windows if w.axis == axis)
     if (window := next(windows, None)) is None:
         return None
-    before, after = (_read_stretch(results, name, window) for name in (rung.parent, rung.model))
-    if before is None or after is None:
-        return None
+    every = (_read_stretch(results, name, window) for name in (rung.parent, rung.model))
+    found = [stretch for stretch in every if stretch is not None]
     added = join_names(f"`{name}`" for name in (rung.added or "").split(", "))
-    return _Window(window, added, before, after)
+    return (window, added, found) if len(found) == 2 else None
 
 
-def _draw_window(top: Axes, bottom: Axes, found: _Window, unit: str) -> list[float]:
+def _draw_window(
+    top: Axes, bottom: Axes, window: WorstWindow, stretches: Sequence[pd.DataFrame], unit: str
+) -> list[float]:
     """Draw forces above residuals; return the RMS residuals in the window, without and with."""
-    window, axis = found.window, found.window.axis
-    measured = found.before[f"torque_measured_{axis}"]
-    top.plot(found.before["t"], measured, color=style.FAINT, lw=2.6, label="measured")
-    errors = []
-    for frame, title, colour, look in (
-        (found.before, "without", style.VERMILLION, (0, (4, 1.5))),
-        (found.after, "with", style.BLUE, "-"),
-    ):
+    axis, times = window.axis, stretches[0]["t"]
+    measured = stretches[0][f"torque_measured_{axis}"]
+    top.plot(times, measured, color=style.FAINT, lw=2.6, label="measured")
+    errors, looks = [], (("without", style.VERMILLION, (0, (4, 1.5))), ("with", style.BLUE, "-"))
+    for frame, (title, colour, look) in zip(stretches, looks, strict=True):
         top.plot(frame["t"], frame[f"torque_predicted_{axis}"], color=colour, ls=look, label=title)
         residual = frame[f"residual_{axis}"]
         bottom.plot(frame["t"], residual, color=colour, ls=look)

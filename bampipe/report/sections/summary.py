@@ -44,8 +44,8 @@ def list_blocks(results: Results) -> Iterator[Block]:
             text += f" The trials cannot distinguish it from: {others}."
         text += " No result below is valid before the session file is corrected."
         yield Callout("attention", f"Set-up: {mistake.sentence}", text)
-    if setup and setup.warnings:
-        yield Callout("note", "Doubtful set-up", " ".join(f"{line}." for line in setup.warnings))
+    if setup and (doubts := _list_doubts(results, setup)):
+        yield Callout("note", "Doubtful set-up", " ".join(f"{line}." for line in doubts))
     if results.outdated:
         steps = ", ".join(f"`{step}`" for step in results.outdated)
         text = f"Run these again before relying on their results: {steps}."
@@ -55,6 +55,15 @@ def list_blocks(results: Results) -> Iterator[Block]:
     yield _describe_session(results)
     yield _describe_ladder(results)
     yield _tabulate_numbers(results)
+
+
+def _list_doubts(results: Results, setup: SetupResult) -> list[str]:
+    """Return the warnings of the set-up, without what the model shown explains by its effects."""
+    validated = results.read(ValidateResult)
+    judged = validated.axes if validated else {}
+    explained = {axis for axis, error in judged.items() if error.standing != "above_floor"}
+    doubts = results.order_axes(setup.unexplained)
+    return [*setup.warnings, *(said for axis, said in doubts.items() if axis not in explained)]
 
 
 def _describe_session(results: Results) -> str:
