@@ -61,7 +61,7 @@ def _list_doubts(results: Results, setup: SetupResult) -> list[str]:
     """Return the warnings of the set-up, without what the model shown explains by its effects."""
     validated = results.read(ValidateResult)
     judged = validated.axes if validated else {}
-    explained = {axis for axis, error in judged.items() if error.standing != "above_floor"}
+    explained = {axis for axis, error in judged.items() if error.standing == "at_floor"}
     doubts = results.order_axes(setup.unexplained)
     return [*setup.warnings, *(said for axis, said in doubts.items() if axis not in explained)]
 
