@@ -162,7 +162,7 @@ def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
                 f" '{first}' (at most {np.max(steps):.3g} s apart)"
             )
     remarks = [*raw.remarks, *remarks]
-    return replace(raw, columns=columns, kept=raw.rows[rows], remarks=tuple(remarks), resumed=())
+    return replace(raw, columns=columns, rows=raw.rows[rows], remarks=tuple(remarks))
 
 
 def _is_sparse(known: np.ndarray) -> bool:
@@ -223,9 +223,8 @@ def _by_rows(raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part) -> R
     if most > least:
         longer = entry.file if counts[0] == most else part.file
         remark += f"; the last {most - least} of {longer} left out"
-    columns = {**raw.columns, **other.columns}
-    shortened = {name: values[:least] for name, values in columns.items()}
-    return _with_columns(raw, other, shortened, remark)
+    joined = _with_columns(raw, other, {**raw.columns, **other.columns}, remark)
+    return joined.between(0, least)
 
 
 def _by_time(

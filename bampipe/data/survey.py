@@ -456,7 +456,7 @@ class _Logs:
         starts = starts_of(raw, column if times else "")
         if len(starts) == 1:
             return [trial]
-        wanted = {raw.first_row - 1, *(int(raw.rows[at]) for at in starts)}
+        wanted = {int(raw.rows[0]) - 1, *(int(raw.rows[at]) for at in starts)}
         with path.open(encoding="utf-8", errors="replace") as file:
             numbered = enumerate(file if is_text(trial.file) else (), 1)
             lines = [re.split("[,;\t]", x.strip()) for n, x in numbered if n in wanted]

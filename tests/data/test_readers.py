@@ -68,7 +68,7 @@ KINDS = [
 def test_all_kinds_of_file_give_the_same_numbers(tmp_path, name, content):
     trial = read(tmp_path / name, content)
     assert list(trial.columns) == list(TABLE) and trial.notes == ()
-    assert trial.first_row == (2 if "csv" in name.lower() else 1)
+    assert trial.rows[0] == (2 if "csv" in name.lower() else 1)
     for column, values in TABLE.items():
         assert trial.columns[column].dtype == np.float64
         np.testing.assert_allclose(trial.columns[column], values, atol=1e-7)

@@ -102,7 +102,9 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
     own = [c for c in wanted.columns if at_one_rate.get(c) is not arrays.get(c)]
     said = f"interpolated linearly at the times of the longest: {join_names(own)}"
     remarks = (said,) if own else ()
-    return RawTrial(aligned(values, what), 1, remarks=remarks, units=units, begun=starts)
+    columns = aligned(values, what)
+    rows = np.arange(1, 1 + len(next(iter(columns.values()), ())))
+    return RawTrial(columns, rows, remarks=remarks, units=units, begun=starts)
 
 
 def _read_column(array: Stored, index: int | None, form: str | None) -> np.ndarray:

@@ -135,7 +135,7 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
                 f"{stream.topic} interpolated linearly at the times of {clock.topic}"
                 f" (at most {gap:.3g} s between its messages)"
             )
-    return RawTrial(values, first_row=1, remarks=tuple(filter(None, remarks)))
+    return RawTrial(values, np.arange(1, 1 + len(base)), remarks=tuple(filter(None, remarks)))
 
 
 def _read_streams(path: Path, fields: Mapping[str, Field], wanted: Wanted) -> list[_Stream]:

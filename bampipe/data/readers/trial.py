@@ -57,48 +57,32 @@ class RawTrial:
 
     Attributes:
         columns: (T,) float64 a column, NaN where a cell is empty.
-        first_row: number that the first sample has in the file, for messages.
+        rows: (T,) int64, the row or number of each sample in the file, for messages.
         notes: what was left out, one sentence each.
         remarks: what was found out about the file, one sentence each.
         units: units that the file itself gives to its columns.
-        resumed: after lines that hold no sample, the sample that follows and its row.
         begun: samples at which another recording begins: the header stands again, or an episode.
         since: of columns of dates and times, where known, their first moment, ns since 1970.
-        kept: (T,) rows of the samples, where some between them were left out.
     """
 
     columns: dict[str, np.ndarray]
-    first_row: int
+    rows: np.ndarray
     notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
-    resumed: tuple[tuple[int, int], ...] = ()
     begun: tuple[int, ...] = ()
     since: Mapping[str, int] = field(default_factory=dict)
-    kept: np.ndarray | None = None
 
     def __len__(self) -> int:
-        return len(next(iter(self.columns.values()), ()))
-
-    @property
-    def rows(self) -> np.ndarray:
-        """Row in the file of every sample, (T,) int64."""
-        if self.kept is not None:
-            return self.kept
-        rows = np.arange(self.first_row, self.first_row + len(self), dtype=np.int64)
-        for sample, row in self.resumed:
-            rows[sample:] += row - rows[sample] if sample < len(rows) else 0
-        return rows
+        return len(self.rows)
 
     def between(self, start: int, stop: int) -> "RawTrial":
         """The samples from ``start`` to before ``stop``."""
         return replace(
             self,
             columns={name: values[start:stop] for name, values in self.columns.items()},
-            first_row=int(self.rows[start]),
-            resumed=tuple((at - start, row) for at, row in self.resumed if start < at < stop),
+            rows=self.rows[start:stop],
             begun=tuple(at - start for at in self.begun if start < at < stop),
-            kept=None if self.kept is None else self.kept[start:stop],
         )
 
 
