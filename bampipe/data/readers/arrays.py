@@ -19,6 +19,7 @@ import numpy as np
 
 from bampipe.data.readers import moments, trial
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.data.refusals import refusal
 from bampipe.data.units import SCALES, in_steps, units_beside, units_in
 from bampipe.data.vocabulary import word_set
 from bampipe.errors import InputError, located
@@ -112,10 +113,7 @@ def _read_column(array: Stored, index: int | None, form: str | None) -> np.ndarr
     if form is not None and array.kind in _NUMBERS:
         raise InputError("not text, expected dates and times")
     if form is None and array.kind in _STAMPED:
-        raise InputError(
-            "not numbers, but dates and times or text",
-            remedy='is it the time? then say unit = "datetime" under [time]',
-        )
+        raise refusal("no_numbers")
     cells = pick(array.load(), index)
     if form is None:
         return np.array(cells, dtype=np.float64)  # a copy: what stands in a file is not written to
@@ -134,11 +132,7 @@ def _fault(variable: str, known: Arrays, where: str) -> InputError:
         return InputError("a link, expected numbers in this file", where=where)
     if variable not in known:
         check_columns(list(known), [variable])
-    return InputError(
-        "not numbers, expected a vector of real numbers",
-        where=where,
-        remedy="save it as a numeric array: cells, tables and objects are not",
-    )
+    return refusal("no_vector", where)
 
 
 def columns_of_arrays(arrays: Arrays) -> dict[str, str]:
@@ -380,10 +374,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         loaded = np.load(path, allow_pickle=False)
         whole = {"data": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
     except ValueError as error:
-        raise InputError(
-            "not sound, or pickled Python objects, which are not read",
-            remedy="save arrays of numbers: np.savez(FILE, t=t, q=q, tau=tau)",
-        ) from error
+        raise refusal("pickled") from error
     found: dict[str, Stored] = {}
     units = units_beside({x: str(a.ravel()[0]) for x, a in whole.items() if a.size == 1})
     for key, array in whole.items():
@@ -394,11 +385,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         (name, array.shape) for name, array in found.items() if len(labels("", array.shape)) == 0
     ]
     if wanted is None and blocks and len(blocks) == len(sampled):
-        name, shape = blocks[0]
-        raise InputError(
-            f"'{name}' is a {_by(shape)} array, of which no side is said to be the samples",
-            remedy="save each trial as an array of its own, samples by channels",
-        )
+        raise refusal("block", name=blocks[0][0], shape=_by(blocks[0][1]))
     yield found, ()
 
 

@@ -11,6 +11,7 @@ from typing import BinaryIO, Literal, cast
 import numpy as np
 from pydantic import Field
 
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError, did_you_mean
 from bampipe.schema import Declaration, Distinct, Text
 
@@ -89,11 +90,8 @@ class RawTrial:
 def check_size(rows: int, wanted: Wanted) -> None:
     """Raise InputError where ``rows`` samples of the wanted columns take too much memory."""
     if rows * len(wanted.columns) * 8 > wanted.largest_bytes:
-        raise InputError(
-            f"{rows} rows of {len(wanted.columns)} columns are more than the"
-            f" {wanted.largest_bytes >> 20} MB allowed",
-            remedy="split the trial, or allow more (largest_trial_mb)",
-        )
+        most = wanted.largest_bytes >> 20
+        raise refusal("too_large", rows=rows, columns=len(wanted.columns), most=most)
 
 
 def check_columns(found: Sequence[str], wanted: Sequence[str], where: str = "") -> None:
@@ -109,11 +107,7 @@ def check_columns(found: Sequence[str], wanted: Sequence[str], where: str = "") 
             )
         if list(found).count(column) > 1:
             first, second = [n for n, other in enumerate(found, 1) if other == column][:2]
-            raise InputError(
-                f"column '{column}' stands twice, as columns {first} and {second}",
-                where=where,
-                remedy="keep the right one",
-            )
+            raise refusal("stands_twice", where, column=column, first=first, second=second)
 
 
 def aligned(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
