@@ -1,6 +1,7 @@
 """Encoder readings: whole counts, no wraps, no jumps; and motion as the kind of trial has it."""
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import median_filter
 
 from bampipe.arrays import Array, Indices
@@ -35,13 +36,9 @@ def integrate(table: TrialTable, encoder: Encoder) -> None:
     """
     if not encoder.integrate:
         return
-    table.columns[encoder.column] = integral(table.t, table.columns[encoder.column])
+    rate = table.columns[encoder.column]
+    table.columns[encoder.column] = cumulative_trapezoid(rate, table.t, initial=0.0)
     table.notes.append(f"position is the integral of the velocity '{encoder.column}', from 0")
-
-
-def integral(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Position (T,) from 0 by trapezia, of a velocity (T,) at ``t`` (T,), s."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t))])
 
 
 def unwrap(table: TrialTable, encoder: Encoder) -> None:
@@ -135,7 +132,8 @@ def check_velocity(table: TrialTable, encoder: Encoder) -> None:
     position = (table.columns[encoder.column] - encoder.zero) * encoder.scale
     # Distances over short stretches: as moved, and as expected by the velocity.
     every = max(1, round(_WINDOW_S / float(np.median(np.diff(table.t)))))
-    moved, expected = (np.diff(x[::every]) for x in (position, integral(table.t, speed)))
+    reached = cumulative_trapezoid(speed, table.t, initial=0.0)
+    moved, expected = (np.diff(x[::every]) for x in (position, reached))
     size = float(moved @ moved), float(expected @ expected)
     if len(moved) < 10 or not all(size):
         return

@@ -33,8 +33,8 @@ Reader = ModuleType | arrays.ArrayReader
 _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     (TEXTS, text, "", ""),
     (SHEETS, text, "workbook of Excel", "save it again, or export the sheet as CSV"),
-    ((".parquet",), parquet, "Parquet file", _AGAIN),
-    ((".feather", ".arrow"), parquet, "Feather file", _AGAIN),
+    ((".parquet",), parquet.READER, "Parquet file", _AGAIN),
+    ((".feather", ".arrow"), parquet.READER, "Feather file", _AGAIN),
     ((".mat",), mat.READER, "MATLAB file", "save it again from MATLAB"),
     (hdf5.ENDINGS, hdf5.READER, "HDF5 file", _AGAIN),
     (_OBJECTS, objects.READER, "", ""),

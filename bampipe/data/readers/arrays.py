@@ -351,15 +351,18 @@ class ArrayReader:
         what: an array of such a file is called in messages.
         opened: what a file holds, while it is open, and what was left out, a sentence each; for
             what is wanted of it, or to list it.
+        begun: samples from which on another recording stands in a file without runs.
     """
 
     what: str
     opened: Callable[[Path, Wanted | None], AbstractContextManager[Opened]]
+    begun: Callable[[Path], tuple[int, ...]] = lambda path: ()
 
     def read(self, path: Path, wanted: Wanted) -> RawTrial:
         """The wanted columns; `InputError` as `read_arrays`, or where the file is damaged."""
         with self.opened(path, wanted) as (arrays, notes):
-            return replace(read_arrays(arrays, wanted, self.what), notes=notes)
+            trial = read_arrays(arrays, wanted, self.what)
+            return replace(trial, notes=notes, begun=trial.begun or self.begun(path))
 
     def columns(self, path: Path) -> dict[str, str]:
         """Names and units of the columns that were recorded together; see `columns_of_arrays`."""
