@@ -105,17 +105,19 @@ def test_units_of_names_and_of_the_line_below_are_taken_and_what_was_found_is_sa
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "said", "ending"),
     [
-        *((it["text"], it["said"]) for it in REFUSED["texts"]),
-        (table(";", ",") + "0,41;1.5;3\n0,42;1,5;3\n", "'1.5' in row 42 a point"),
-        (table(";") + "0.41;1,5;3\n0.42;1.5;3\n", "'1,5' in row 42 has a decimal comma"),
-        (table(" ") + "  0.4  x1  9\n" * 2, "row 42, column 'x': found 'x1', expected a number"),
+        *((it["text"], it["said"], it.get("ending", ".csv")) for it in REFUSED["texts"]),
+        (table(";", ",") + "0,41;1.5;3\n0,42;1,5;3\n", "'1.5' in row 42 a point", ".csv"),
+        (table(";") + "0.41;1,5;3\n0.42;1.5;3\n", "'1,5' in row 42 has a decimal comma", ".csv"),
+        (table(" ") + "  0.4  x1  9\n" * 2, "row 42, column 'x': found 'x1', expected a", ".csv"),
+        ("[" * 100_000, "not sound JSON", ".json"),
+        ('[{"t": 0, "x": 1' + "0" * 400 + ', "n": 1}]', "beyond all range", ".json"),
     ],
 )  # fmt: skip
-def test_what_can_be_read_in_two_ways_is_refused(tmp_path, text, said):
+def test_what_is_no_table_or_can_be_read_in_two_ways_is_refused(tmp_path, text, said, ending):
     with pytest.raises(InputError) as caught:
-        read(tmp_path, text)
+        read(tmp_path, text, ending=ending)
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 

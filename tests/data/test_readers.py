@@ -195,27 +195,6 @@ def test_samples_that_are_json_objects(tmp_path, text, name):
     assert list(columns_of(tmp_path / "b.jsonl")) == ["t", "q.x"]
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('{"log": [{"t": 0}]}', "no column 'x'"),
-        ('{"a": [{"t": 0}], "b": [{"x": 0}]}', "2 lists of samples: a, b"),
-        ('{"a": 3}', "no list of samples"),
-        ("3", "no list of samples"),
-        ("[]", "no samples"),
-        ('[{"t": 0, "x": 1}, 5]', "sample 2: not an object"),
-        ('[{"t": 0, "x": "fast"}]', "sample 1, 'x': found 'fast', expected a number"),
-        ('[{"t": 0, "x": 1}, {"t": 1, "x":', "not sound JSON at line 1"),
-        ("[" * 100_000, "not sound JSON"),
-        ('[{"t": 0, "x": 1' + "0" * 400 + "}]", "beyond all range"),
-    ],
-)
-def test_json_that_is_no_trial_is_refused_in_one_line(tmp_path, text, said):
-    with pytest.raises(InputError) as caught:
-        read_json(tmp_path, text)
-    assert said in str(caught.value) and "\n" not in str(caught.value)
-
-
 def test_a_log_that_is_no_regular_file(tmp_path):
     os.mkfifo(tmp_path / "a.csv")
     with pytest.raises(InputError, match="not a regular file"):
