@@ -204,13 +204,10 @@ class _Logs:
         if not paths:
             others = [p.relative_to(folder).as_posix() for p in files]
             names = join_names([name for name, _ in self.passed] or others, 4)
-            raise InputError(
-                f"no log in this folder{names and f' that can be read, but {names}'}",
-                where=str(folder),
-                remedy=self.passed[0][1]
-                if self.passed
-                else f"supported file extensions are {', '.join(readers.EXTENSIONS)}",
-            )
+            but = names and f" that can be read, but {names}"
+            remedy = f"supported file extensions are {', '.join(readers.EXTENSIONS)}"
+            remedy = next((why for _, why in self.passed), remedy)
+            raise InputError(f"no log in this folder{but}", where=str(folder), remedy=remedy)
         if len(paths) > MOST_FILES:
             raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
         return paths

@@ -404,19 +404,13 @@ def _fault(message: str, layout: TableLayout, line: Line) -> InputError:
     """The plain form of Arrow's message on a line of a text file."""
     where, cell = f"row {line.number}", _CELL.search(message)
     if torn := _TORN.search(message):
-        expected, actual, text = int(torn[2]), int(torn[3]), torn[4]
-        commas = actual > expected and re.fullmatch(r'[\s"0-9,+-]*', text)
+        known, text = {"expected": int(torn[2]), "actual": int(torn[3])}, torn[4]
         clock = re.search(r"\d+:\d\d:\d\d,\d+", text) if layout.delimiter == "," else None
-        remedy = "the line is damaged: take it out of the file"
-        if commas:
-            remedy = "decimal commas? put semicolons between columns, or points as decimal sign"
-        elif clock and actual > expected:
-            remedy = (
-                f"the comma in '{clock[0]}' separates columns, too: export with semicolons between"
-                " columns, or a point before the fraction of a second"
-            )
-        what = f"{actual} cells, where the header has {expected}"
-        return InputError(what, where=where, remedy=remedy)
+        if known["actual"] > known["expected"] and re.fullmatch(r'[\s"0-9,+-]*', text):
+            return refusal("torn_at_decimals", where, **known)
+        if known["actual"] > known["expected"] and clock:
+            return refusal("torn_at_seconds", where, **known, clock=clock[0])
+        return refusal("torn", where, **known)
     assert cell is not None
     column, value = layout.header[int(cell[1])], cell[3]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
@@ -424,8 +418,6 @@ def _fault(message: str, layout: TableLayout, line: Line) -> InputError:
     remedy = str(next(fitting, {"remedy": ""})["remedy"])
     if moments.is_moment(value):
         remedy = 'is it the time? then say unit = "datetime" under [time]'
-    return InputError(
-        f"found '{shown}', expected a number",
-        where=f"{where}, column '{column}'",
-        remedy=remedy.format(cell=value.strip(), decimal=layout.decimal),
-    )
+    remedy = remedy.format(cell=value.strip(), decimal=layout.decimal)
+    where = f"{where}, column '{column}'"
+    return InputError(f"found '{shown}', expected a number", where=where, remedy=remedy)

@@ -99,12 +99,9 @@ def check_columns(found: Sequence[str], wanted: Sequence[str], where: str = "") 
     for column in wanted:
         if column not in found:
             shown = ", ".join(found[:12]) + (", ..." if len(found) > 12 else "")
-            others = [other for other in found if other not in wanted]
-            raise InputError(
-                f"no column '{column}'{did_you_mean(column, others)}",
-                where=where,
-                remedy=f"it has {shown}" if shown else "",
-            )
+            near = did_you_mean(column, [other for other in found if other not in wanted])
+            remedy = f"it has {shown}" if shown else ""
+            raise InputError(f"no column '{column}'{near}", where=where, remedy=remedy)
         if list(found).count(column) > 1:
             first, second = [n for n, other in enumerate(found, 1) if other == column][:2]
             raise refusal("stands_twice", where, column=column, first=first, second=second)
