@@ -124,6 +124,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     return table
 
 
+def packaged_table(module: str) -> dict[str, Any]:
+    """The table in the TOML file that stands beside a module, given its ``__file__``."""
+    return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
+
+
 def is_normal(name: object) -> bool:
     """Whether ``name`` is the normal form of a path below a folder: ``a``, ``a/b``, ``a/b/c``.
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from bampipe.arrays import Array
 from bampipe.data import robot_tree
 from bampipe.data.mjcf import mjcf_tree
+from bampipe.data.refusals import refusal
 from bampipe.data.robot_tree import MOVING, LumpedBodies, Tree, TreeJoint, identifier
 from bampipe.data.robot_xml import read_xml
 from bampipe.data.urdf import urdf_tree
@@ -190,10 +191,7 @@ def _refuse_broken(tree: Tree) -> None:
             raise InputError("an axis of length zero", where=f"joint {joint.name!r}")
     if len(tree.above) < len(tree.joints):
         twice = next(j for j in tree.joints if tree.above[j.child] is not j)
-        raise InputError(
-            f"link {twice.child!r} has two joints above it: a closed loop",
-            remedy="cut the loop: leave one of the joints out",
-        )
+        raise refusal("closed_loop", link=twice.child)
     for link in tree.above:
         tree.way(link)
 
@@ -208,10 +206,7 @@ def _only_root(tree: Tree) -> str:
     if not roots:
         raise InputError("no links")
     if len(roots) != 1:
-        raise InputError(
-            f"{len(roots)} links have nothing above them: {join_names(roots, _MANY)}",
-            remedy="name the one that stands still: base = ...",
-        )
+        raise refusal("several_roots", count=len(roots), roots=join_names(roots, _MANY))
     return roots[0]
 
 

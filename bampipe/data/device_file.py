@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from bampipe.arrays import Array
+from bampipe.data.refusals import refusal
 from bampipe.data.robot_tree import Body, DriveLimits, Tree, fixed_joint, symmetric, tree_of_tables
-from bampipe.errors import InputError
 from bampipe.files import read_toml
 
 _UNITS = {"revolute": ("rad", "N.m", "kg.m2"), "prismatic": ("m", "N", "kg")}
@@ -73,11 +73,7 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     if not isinstance(joints, Mapping) or not all(isinstance(j, Mapping) for j in joints.values()):
         return table
     if len(joints) > _MOST_JOINTS:
-        raise InputError(
-            f"{len(joints)} joints; a robot has at most {_MOST_JOINTS}",
-            where=where,
-            remedy='choose a part: base = "..." and tip = "..." in [robot]',
-        )
+        raise refusal("many_joints", where, joints=len(joints), most=_MOST_JOINTS)
     kinds = {j: str(entry.get("kind")) for j, entry in joints.items() if not entry.get("follows")}
     if not set(kinds.values()) <= set(_UNITS):
         return table
@@ -112,11 +108,7 @@ def _robot_file(robot: Mapping[str, Any], where: str) -> Path | None:
         return None
     file = Path(name)
     if file.is_absolute() or ".." in file.parts:
-        raise InputError(
-            f"path '{name}' leaves the folder of the device file",
-            where=f"{where}: robot.urdf",
-            remedy="copy the robot's file beside the device file",
-        )
+        raise refusal("robot_outside", f"{where}: robot.urdf", path=name)
     return file
 
 

@@ -6,7 +6,6 @@ is written whole or not at all; the same rows give the same bytes.
 """
 
 import shutil
-import tomllib
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +16,7 @@ import pyarrow as pa
 
 from bampipe.data import store
 from bampipe.errors import InputError
+from bampipe.files import packaged_table
 
 Row = Mapping[str, object]
 
@@ -33,8 +33,7 @@ def _table(*columns: str) -> dict[str, pa.DataType]:
     return {name: _KINDS[kind or "number"] for name, _, kind in pairs}
 
 
-_COLUMNS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-TABLES: dict[str, dict[str, pa.DataType]] = {name: _table(*own) for name, own in _COLUMNS.items()}
+TABLES = {name: _table(*own) for name, own in packaged_table(__file__).items()}
 """Columns of each table; ``device`` stands in the path."""
 
 

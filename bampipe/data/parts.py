@@ -17,6 +17,7 @@ from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
 from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import MOST_APART
+from bampipe.data.refusals import refusal
 from bampipe.data.session import SECONDS, Part, TrialEntry
 from bampipe.data.session.channels import TimeUnit
 from bampipe.errors import InputError
@@ -104,12 +105,7 @@ def join_parts(
             except InputError as error:
                 turns, rest = divmod(own_clock.samples, clock.samples)
                 if roles[other] == {"time"} and turns > 1 and rest == 0:
-                    raise InputError(
-                        f"{turns} rows for each time in {other}: {turns} axes in one column?",
-                        where=main,
-                        remedy=f"write a column for each: .reshape(-1, {turns}) where they take"
-                        f" turns, .reshape({turns}, -1).T where one is below the other",
-                    ) from error
+                    raise refusal("rows_in_turn", main, turns=turns, other=other) from error
                 reasons.append(str(error))
                 continue
             alike |= set(found[other]) & set(found[main]) - {own_clock.column}
@@ -160,11 +156,8 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
             if _TOO_FEW * counts[0] < counts[1]:
                 join, why = "", "these are too few"
     if not join:
-        raise InputError(
-            f"{second.samples} samples, where {main} has {first.samples}, and {why}",
-            where=other,
-            remedy="are they one recording? export them at one rate, or each with its time",
-        )
+        of = {"here": second.samples, "main": main, "there": first.samples, "why": why}
+        raise refusal("no_part", other, **of)
     timed = join != "rows"
     return Part(
         file=other,

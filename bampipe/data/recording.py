@@ -12,6 +12,7 @@ from bampipe.data.quality.clock import goes_on, unroll
 from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, check_columns, interpolated
+from bampipe.data.refusals import refusal
 from bampipe.data.session import SECONDS, Clock, Part, Session, TrialEntry, inside
 from bampipe.errors import InputError
 from bampipe.files import digest_file
@@ -162,7 +163,7 @@ def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
                 f" '{first}' (at most {np.max(steps):.3g} s apart)"
             )
     remarks = [*raw.remarks, *remarks]
-    return replace(raw, columns=columns, kept=raw.rows[rows], remarks=tuple(remarks), resumed=())
+    return replace(raw, columns=columns, rows=raw.rows[rows], remarks=tuple(remarks))
 
 
 def _is_sparse(known: np.ndarray) -> bool:
@@ -214,18 +215,13 @@ def _by_rows(raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part) -> R
     counts = len(raw), len(other)
     least, most = min(counts), max(counts)
     if most - least > max(1, MOST_APART * most):
-        raise InputError(
-            f"{counts[1]} samples, where {entry.file} has {counts[0]}",
-            where=part.file,
-            remedy='files of different rates are joined by their times: join = "time" or "start"',
-        )
+        raise refusal("other_count", part.file, here=counts[1], main=entry.file, there=counts[0])
     remark = f"{part.file} joined to {entry.file} row by row"
     if most > least:
         longer = entry.file if counts[0] == most else part.file
         remark += f"; the last {most - least} of {longer} left out"
-    columns = {**raw.columns, **other.columns}
-    shortened = {name: values[:least] for name, values in columns.items()}
-    return _with_columns(raw, other, shortened, remark)
+    joined = _with_columns(raw, other, {**raw.columns, **other.columns}, remark)
+    return joined.between(0, least)
 
 
 def _by_time(
@@ -241,11 +237,7 @@ def _by_time(
         stamps += u_0 * ticks[1] - t_0 * ticks[0] + moments / NANOSECONDS
     span = min(np.nanmax(at), np.nanmax(stamps)) - max(np.nanmin(at), np.nanmin(stamps))
     if not span > 0.0:
-        raise InputError(
-            f"no time in common with {entry.file}: it starts {np.nanmin(stamps):.4g} s after that",
-            where=part.file,
-            remedy='join = "start" where both clocks count from the same moment',
-        )
+        raise refusal("no_common_time", part.file, main=entry.file, late=np.nanmin(stamps))
     kept = {name: values for name, values in other.columns.items() if name != time}
     found = {name: interpolated(at, stamps, values) for name, values in kept.items()}
     remark = f"{part.file} interpolated linearly at the times of {entry.file}"
@@ -275,14 +267,9 @@ def _one_of(raw: RawTrial, entry: TrialEntry, clock: Clock) -> RawTrial:
         return raw
     if entry.recording is None or entry.recording > count:
         at = starts[min(1, count - 1)]
-        what = "another recording begins" if at in raw.begun else "time starts again"
-        raise InputError(
-            f"{what}: {count} recordings in one file" if count > 1 else "one recording only",
-            where=f"{entry.file}, row {raw.rows[at]}",
-            remedy="give each a [[trials]] entry with recording = 1, 2, ..."
-            if count > 1
-            else "leave recording out",
-        )
+        begun = "another recording begins" if at in raw.begun else "time starts again"
+        name = "several_recordings" if count > 1 else "one_recording"
+        raise refusal(name, f"{entry.file}, row {raw.rows[at]}", begun=begun, count=count)
     said = f"recording {entry.recording} of {count} in the file"
     part = raw.between(*[*starts, len(raw)][entry.recording - 1 : entry.recording + 1])
     return replace(part, remarks=(*raw.remarks, said))

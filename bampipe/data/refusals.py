@@ -1,11 +1,9 @@
 """What is refused of sessions and logs, and what to do, by the texts of ``refusals.toml``."""
 
-import tomllib
-from pathlib import Path
-
 from bampipe.errors import InputError
+from bampipe.files import packaged_table
 
-_REFUSALS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_REFUSALS = packaged_table(__file__)
 
 
 def refusal(name: str, where: str = "", /, **known: object) -> InputError:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bampipe.arrays import Array
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError
 
 _BELOW_ZERO = 1e-6
@@ -173,12 +174,7 @@ class Tree:
             raise InputError(f"no chain of joints leads from link {base!r} to link {tip!r}")
         for joint in way[links.index(base) :]:
             if joint.kind not in (*MOVING, "fixed"):
-                raise InputError(
-                    f"a joint of type {joint.kind!r}",
-                    where=f"joint {joint.name!r}",
-                    remedy="between base and tip joints are revolute, continuous, prismatic or"
-                    " fixed",
-                )
+                raise refusal("joint_type", f"joint {joint.name!r}", kind=joint.kind)
         return way[links.index(base) :]
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bampipe.arrays import Array
 from bampipe.data.readers.trial import check_columns
+from bampipe.data.refusals import refusal
 from bampipe.data.session import Session
 from bampipe.errors import InputError
 
@@ -57,19 +58,13 @@ class StreamLayout:
         where = str(session.root / "session.toml")
         clock = session.clock
         if clock.datetime or clock.nanoseconds or not clock.column:
-            raise InputError(
-                "a stream needs one time column, which holds numbers",
-                where=f"{where}: time",
-                remedy="write seconds, or microseconds as time_us",
-            )
+            raise refusal("stream_time", f"{where}: time")
         for rate in (encoder.name for encoder in session.encoders if encoder.integrate):
-            what = f"axis {rate} has a velocity and no position, which a stream cannot do without"
-            raise InputError(what, where=where, remedy="log the position")
+            raise refusal("stream_velocity", where, axis=rate)
         registers = [encoder.name for encoder in session.encoders if encoder.sign_bit]
         registers += [c.name for c in session.channels if c.sign_bit or c.wrap_bits]
         for register in registers:
-            what = f"{register} is a register that holds a sign, which a stream cannot undo"
-            raise InputError(what, where=where, remedy="log it as a signed number")
+            raise refusal("stream_register", where, register=register)
         known = [(clock.column, "t", session.tick, 0.0)]
         known += [(e.column, f"q_{e.name}", e.scale, -e.zero * e.scale) for e in session.encoders]
         known += [(b.column, f"brake_{b.axis}", 1.0, 0.0) for b in session.brakes]

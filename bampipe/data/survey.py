@@ -132,14 +132,14 @@ class Survey:
 def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Survey:
     """Look through the logs in ``folder`` and the folders in it.
 
-    ``names``: of the columns of texts without a header; ``episodes``: see `lerobot.open_dataset`.
+    ``names``: of the columns of texts without a header; ``episodes``: see `lerobot.find_episodes`.
 
     Raises:
         InputError: no such folder, no log in it, too many, or none that can be read.
     """
-    dataset = lerobot.open_dataset(folder, episodes)
-    logs = _Logs(folder, Dialect(names=tuple(names)), dataset)
-    logs.look_through([folder / file for file in dataset.episodes] if dataset else logs.paths())
+    wanted = lerobot.find_episodes(folder, episodes)
+    logs = _Logs(folder, Dialect(names=tuple(names)), wanted)
+    logs.look_through([folder / file for file in wanted] if wanted else logs.paths())
     logs.hear_notes()
     trials, common = logs.choose()
     read: tuple[SurveyedColumn, ...] = ()
@@ -161,7 +161,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
         replace(c, **beside.pop(c.role), by_looks=False) if c.by_looks and c.role in beside else c
         for c in columns
     )
-    if dataset is not None:
+    if wanted is not None:
         logs.remarks = [VOCABULARY["remarks"]["lerobot"]]
     remarks, timed = (*logs.remarks, *guessed), any(c.role == "time" for c in columns)
     stated = {} if timed else intervals_stated(folder, {trial.file for trial in sound})
@@ -172,13 +172,13 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
 class _Logs:
     """The files of a folder while it is found out which are logs, and which belong together.
 
-    ``found``: columns and their units, by file; ``passed``, ``remarks``: see `Survey`; ``beside``:
-    units of quantities that are no columns.
+    ``episodes``: see `lerobot.find_episodes`; ``found``: columns and their units, by file;
+    ``passed``, ``remarks``: see `Survey`; ``beside``: units of quantities that are no columns.
     """
 
     folder: Path
     dialect: Dialect
-    dataset: lerobot.DataSet | None = None
+    episodes: Mapping[str, Sequence[int]] | None = None
     found: dict[str, dict[str, str]] = field(default_factory=dict)
     passed: list[tuple[str, str]] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
@@ -204,13 +204,10 @@ class _Logs:
         if not paths:
             others = [p.relative_to(folder).as_posix() for p in files]
             names = join_names([name for name, _ in self.passed] or others, 4)
-            raise InputError(
-                f"no log in this folder{names and f' that can be read, but {names}'}",
-                where=str(folder),
-                remedy=self.passed[0][1]
-                if self.passed
-                else f"supported file extensions are {', '.join(readers.EXTENSIONS)}",
-            )
+            but = names and f" that can be read, but {names}"
+            remedy = f"supported file extensions are {', '.join(readers.EXTENSIONS)}"
+            remedy = next((why for _, why in self.passed), remedy)
+            raise InputError(f"no log in this folder{but}", where=str(folder), remedy=remedy)
         if len(paths) > MOST_FILES:
             raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
         return paths
@@ -439,8 +436,8 @@ class _Logs:
         Raises:
             InputError: it cannot be read.
         """
-        if self.dataset is not None:
-            places = self.dataset.recordings(trial.file)
+        if self.episodes is not None:
+            places = self.episodes[trial.file]
             return [trial.model_copy(update={"recording": n}) for n in places]
         path = self.folder / trial.file
         self.scanned += path.stat().st_size
@@ -456,7 +453,7 @@ class _Logs:
         starts = starts_of(raw, column if times else "")
         if len(starts) == 1:
             return [trial]
-        wanted = {raw.first_row - 1, *(int(raw.rows[at]) for at in starts)}
+        wanted = {int(raw.rows[0]) - 1, *(int(raw.rows[at]) for at in starts)}
         with path.open(encoding="utf-8", errors="replace") as file:
             numbered = enumerate(file if is_text(trial.file) else (), 1)
             lines = [re.split("[,;\t]", x.strip()) for n, x in numbered if n in wanted]

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
+from bampipe.data.refusals import refusal
 from bampipe.data.robot_tree import Body, DriveLimits, Tree, TreeJoint, symmetric
 from bampipe.data.robot_xml import Attribute, assign, document, number, numbers, put, read_xml
 from bampipe.errors import InputError, located
@@ -44,11 +45,8 @@ def urdf_tree(root: Element, path: Path) -> Tree:
 
 def unexpanded(path: Path) -> InputError:
     """The error that a file is written in macros."""
-    return InputError(
-        "a xacro file: macros that are no URDF yet",
-        where=str(path),
-        remedy=f"expand it first: xacro {path.name} > {path.name.partition('.')[0]}.urdf",
-    )
+    stem = path.name.partition(".")[0]
+    return refusal("xacro", str(path), name=path.name, stem=stem)
 
 
 def _name(element: Element) -> str:

@@ -1,11 +1,8 @@
 """The words and spellings of ``vocabulary.toml``, by which logs of strangers are understood."""
 
-import tomllib
-from pathlib import Path
-from typing import Any
+from bampipe.files import packaged_table
 
-_FILE = Path(__file__).with_name("vocabulary.toml")
-VOCABULARY: dict[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+VOCABULARY = packaged_table(__file__)
 
 
 def word_set(name: str) -> frozenset[str]:

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 
 from bampipe.data.device_file import read_device_file
+from bampipe.data.refusals import refusal
 from bampipe.data.session import Session
 from bampipe.errors import InputError, did_you_mean, located
 from bampipe.physics import registry
@@ -46,32 +47,21 @@ def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
     axes = {coordinate.name: coordinate.unit for coordinate in device.coordinates}
     for axis in encoders:
         if axis not in axes:
-            yield InputError(
-                f"device '{device.name}' has no axis '{axis}'{did_you_mean(axis, axes)}",
-                where=f"{where}: encoders.{axis}",
-                remedy=f"its axes are {', '.join(axes)}",
-            )
+            known = {"axis": axis, "near": did_you_mean(axis, axes), "axes": ", ".join(axes)}
+            yield refusal("no_axis", f"{where}: encoders.{axis}", **known, device=device.name)
     for axis, unit in axes.items():
         if axis not in encoders:
-            yield InputError(
-                f"no encoder for axis '{axis}' of device '{device.name}'",
-                where=f"{where}: encoders",
-            )
+            yield refusal("no_encoder", f"{where}: encoders", axis=axis, device=device.name)
         elif encoders[axis].unit != unit:
-            yield InputError(
-                f"a unit of {encoders[axis].unit}, but device '{device.name}' has this axis"
-                f" in {unit}",
-                where=f"{where}: encoders.{axis}.unit",
-            )
+            known = {"found": encoders[axis].unit, "expected": unit, "device": device.name}
+            yield refusal("axis_unit", f"{where}: encoders.{axis}.unit", **known)
     given = {channel.name for channel in session.channels}
     given |= set(session.force.names) if session.force else set()
     for name in (*device.forces, *device.channels):
         if name not in given:
-            yield InputError(
-                f"no channel for input '{name}' of device '{device.name}'",
-                where=f"{where}: force",
-                remedy=f"these are given: {', '.join(sorted(given)) or 'none'}",
-            )
+            known = {"input": name, "device": device.name}
+            named = ", ".join(sorted(given)) or "none"
+            yield refusal("no_input", f"{where}: force", **known, given=named)
     wanted = {**dict.fromkeys(device.forces, device.force_unit), **device.channels}
     wanted |= device.controller.channels if device.controller else {}
     for channel in session.channels:
@@ -79,19 +69,14 @@ def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
         if device.robot is not None and (channel.unit, expected) == ("N", "N.m"):
             continue  # the drive of a sliding joint: its force along the joint
         if not _is_alike(channel.unit, expected):
-            yield InputError(
-                f"a unit of {channel.unit or 'a pure number'}, but device '{device.name}' takes"
-                f" {expected or 'a pure number'}",
-                where=f"{where}: channels.{channel.name}.unit",
-            )
+            place = f"{where}: channels.{channel.name}.unit"
+            found, taken = (unit or "a pure number" for unit in (channel.unit, expected))
+            yield refusal("channel_unit", place, found=found, expected=taken, device=device.name)
     if session.force and not session.force.volts and session.force.unit != device.force_unit:
-        yield InputError(
-            f"found \"{session.force.unit}\", but device '{device.name}' takes {device.force_unit}",
-            where=f"{where}: force.unit",
-            remedy="lever_m, its distance from the axis in m, converts a force to a torque"
-            if (session.force.unit, device.force_unit) == ("N", "N.m")
-            else "",
-        )
+        known = {"found": session.force.unit, "expected": device.force_unit}
+        levered = (session.force.unit, device.force_unit) == ("N", "N.m")
+        name = "lever_lacks" if levered else "force_unit"
+        yield refusal(name, f"{where}: force.unit", **known, device=device.name)
 
 
 def _is_alike(one: str, other: str) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bampipe.errors import InputError
+from bampipe.data.refusals import refusal
 from bampipe.estimate.low_pass import Band
 from bampipe.lists import join_names
 from bampipe.physics import System
@@ -212,11 +212,7 @@ def _require_scale(system: System, motions: Sequence[Motion]) -> None:
         if not sizes[0] <= 1e-12 * sizes[1]:
             return
     names = join_names((system.parameters[i].name for i in free), _MANY)
-    raise InputError(
-        sentence("no_scale", names=names),
-        where=f"device {system.model.device.name!r}",
-        remedy="make a known one a constant, such as the gain of the input",
-    )
+    raise refusal("no_scale", f"device {system.model.device.name!r}", names=names)
 
 
 def _find_placeholders(system: System, session: IngestResult) -> dict[str, tuple[str, ...]]:

@@ -1,9 +1,8 @@
 """What is said of a set-up, by the texts of ``sentences.toml``."""
 
-import tomllib
-from pathlib import Path
+from bampipe.files import packaged_table
 
-SENTENCES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+SENTENCES = packaged_table(__file__)
 
 
 def sentence(name: str, **known: object) -> str:

@@ -93,29 +93,31 @@ def test_units_of_names_and_of_the_line_below_are_taken_and_what_was_found_is_sa
     assert read(tmp_path, text, ("t [s]", "x (mm)", "n")).units == {"t [s]": "s", "x (mm)": "mm"}
     trial = read(tmp_path, WRITTEN["unit row in brackets"])
     assert trial.units == {"t": "s", "x": "mm", "n": "-"}
-    assert trial.first_row == 3 and "row 2 gives units" in trial.remarks
-    assert read(tmp_path, "t,x,n\ns,mm,-\n\n0,1,2\n1,2,3\n").first_row == 4
+    assert trial.rows[0] == 3 and "row 2 gives units" in trial.remarks
+    assert read(tmp_path, "t,x,n\ns,mm,-\n\n0,1,2\n1,2,3\n").rows[0] == 4
     trial = read(tmp_path, PREAMBLE + table(";", ","))
     assert trial.remarks == (
         "columns are separated by semicolons",
         "2 lines above the header passed over",
         "decimal commas",
     )
-    assert trial.first_row == 5 and trial.notes == ()
+    assert trial.rows[0] == 5 and trial.notes == ()
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "said", "ending"),
     [
-        *((it["text"], it["said"]) for it in REFUSED["texts"]),
-        (table(";", ",") + "0,41;1.5;3\n0,42;1,5;3\n", "'1.5' in row 42 a point"),
-        (table(";") + "0.41;1,5;3\n0.42;1.5;3\n", "'1,5' in row 42 has a decimal comma"),
-        (table(" ") + "  0.4  x1  9\n" * 2, "row 42, column 'x': found 'x1', expected a number"),
+        *((it["text"], it["said"], it.get("ending", ".csv")) for it in REFUSED["texts"]),
+        (table(";", ",") + "0,41;1.5;3\n0,42;1,5;3\n", "'1.5' in row 42 a point", ".csv"),
+        (table(";") + "0.41;1,5;3\n0.42;1.5;3\n", "'1,5' in row 42 has a decimal comma", ".csv"),
+        (table(" ") + "  0.4  x1  9\n" * 2, "row 42, column 'x': found 'x1', expected a", ".csv"),
+        ("[" * 100_000, "not sound JSON", ".json"),
+        ('[{"t": 0, "x": 1' + "0" * 400 + ', "n": 1}]', "beyond all range", ".json"),
     ],
 )  # fmt: skip
-def test_what_can_be_read_in_two_ways_is_refused(tmp_path, text, said):
+def test_what_is_no_table_or_can_be_read_in_two_ways_is_refused(tmp_path, text, said, ending):
     with pytest.raises(InputError) as caught:
-        read(tmp_path, text)
+        read(tmp_path, text, ending=ending)
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -131,7 +133,7 @@ def test_the_session_decides_what_the_file_leaves_open(tmp_path):
     np.testing.assert_array_equal(trial.columns["t"], [1.234, 1.235])
     trial = read(tmp_path, "0 1,5 2\n1 2,5 3\n", dialect=Dialect(names=("t", "x", "n")))
     np.testing.assert_array_equal(trial.columns["x"], [1.5, 2.5])
-    assert trial.first_row == 1
+    assert trial.rows[0] == 1
     trial = read(tmp_path, "Weg,\xb5\nm,\xb0\n1,2\n3,4\n", ("Weg",), encoding="latin-1")
     np.testing.assert_array_equal(trial.columns["Weg"], [1.0, 3.0])
     assert trial.units == {"Weg": "m"} and "not UTF-8" in trial.remarks[0]
@@ -185,7 +187,7 @@ def test_the_first_rows_may_lack_cells(tmp_path):
     assert columns_of(path) == {"timestamp": "datetime", "pos (1)": "", "pos (2)": ""}
     trial = read_trial(path, ("timestamp", "pos (2)"), datetimes={"timestamp": ""})
     np.testing.assert_array_equal(trial.columns["pos (2)"][:4], [np.nan, np.nan, 0.0, 2.0])
-    assert trial.columns["timestamp"][2] == pytest.approx(0.01) and trial.first_row == 2
+    assert trial.columns["timestamp"][2] == pytest.approx(0.01) and trial.rows[0] == 2
 
 
 def test_columns_without_a_header_have_numbers(tmp_path):
@@ -203,7 +205,7 @@ def test_recordings_and_chatter_are_found_with_their_rows(tmp_path):
     np.testing.assert_array_equal(trial.rows[[0, 39, 40, 79]], [2, 41, 44, 83])
     second = trial.between(40, 80)
     check(second)
-    assert second.first_row == 44 and second.begun == ()
+    assert second.rows[0] == 44 and second.begun == ()
     trial = read(tmp_path, table() + "0.400,1.0,2,reset alarm, door\n" + "0.410,1.0,2\n")
     assert len(trial) == 41 and trial.notes == ("row 42 ends in words: left out",)
     with pytest.raises(InputError, match="50 lines hold text and no sample, and there are more"):

@@ -49,7 +49,8 @@ def columns(n=N, seed=0):
 
 
 def cleaned(table, kind=0, limits=None, session=SESSION):
-    raw = RawTrial({name: np.array(values, dtype=float) for name, values in table.items()}, 2)
+    held = {name: np.array(values, dtype=float) for name, values in table.items()}
+    raw = RawTrial(held, np.arange(2, 2 + len(held["turn"])))
     return clean(raw, session, session.trials[kind], limits or CleaningLimits())
 
 

@@ -43,7 +43,8 @@ def cleaned(columns: dict[str, np.ndarray], **tables: Any) -> CleanTrial:
         | tables,
         Path(),
     )  # fmt: skip
-    raw = RawTrial({name: np.array(values, dtype=float) for name, values in columns.items()}, 2)
+    held = {name: np.array(values, dtype=float) for name, values in columns.items()}
+    raw = RawTrial(held, np.arange(2, 2 + len(held["q"])))
     return clean(raw, session, session.trials[0], CleaningLimits())
 
 

@@ -31,34 +31,24 @@ def test_json_is_sorted_exact_and_finite(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("read", "content", "said"),
     [
-        *((text, "(not JSON|nested too deeply)") for text in (b"[" * 100_000, b"9" * 5000)),
-        *((text, "not JSON") for text in (b"\xff", b"")),
-        (b'{"a": 1,\n oops}', "line 2"),
-    ],
-)
-def test_json_that_is_no_json_is_named(tmp_path, content, said):
-    (tmp_path / "x.json").write_bytes(content)
-    with pytest.raises(InputError, match=rf"x\.json.*{said}"):
-        read_json(tmp_path / "x.json")
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"a = 1\nb = = 2\n", "line 2"), (b"a = 1\n\xff = 2\n", "line 2: not UTF-8"),
-        (b"a = 2026-13-45\n", "line 1: not TOML"), (b"a = " + b"9" * 5000, "not TOML"),
-        ("a = 1\n".encode("utf-16"), "UTF-16"), (b"a = " + b"[" * 50_000, "nested too deeply"),
-        (b".".join([b"a"] * 5_000) + b" = 1", "nested too deeply"),
-        (b"#" * (files.LARGEST_TOML_BYTES + 1), "larger than 4 MB"),
+        *((read_json, x, "(not JSON|nested too deeply)") for x in (b"[" * 100_000, b"9" * 5000)),
+        (read_json, b"\xff", "not JSON"), (read_json, b"", "not JSON"),
+        (read_json, b'{"a": 1,\n oops}', "line 2"), (read_toml, b"a = 1\nb = = 2\n", "line 2"),
+        (read_toml, b"a = 1\n\xff = 2\n", "line 2: not UTF-8"),
+        (read_toml, b"a = 2026-13-45\n", "line 1: not TOML"),
+        (read_toml, b"a = " + b"9" * 5000, "not TOML"),
+        (read_toml, "a = 1\n".encode("utf-16"), "UTF-16"),
+        (read_toml, b"a = " + b"[" * 50_000, "nested too deeply"),
+        (read_toml, b".".join([b"a"] * 5_000) + b" = 1", "nested too deeply"),
+        (read_toml, b"#" * (files.LARGEST_TOML_BYTES + 1), "larger than 4 MB"),
     ],
 )  # fmt: skip
-def test_toml_that_is_broken_is_named_with_its_line(tmp_path, content, message):
-    path = tmp_path / "x.toml"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        read_toml(path)
+def test_a_broken_file_is_named_with_its_line(tmp_path, read, content, said):
+    (tmp_path / "x.y").write_bytes(content)
+    with pytest.raises(InputError, match=rf"x\.y.*{said}"):
+        read(tmp_path / "x.y")
 
 
 def test_errors_of_files_and_folders_are_plain_and_leave_what_was(tmp_path):

@@ -148,19 +148,6 @@ def test_damaged_files_are_refused(text: str, what: str, tmp_path: Path) -> None
         read_chain(path)
 
 
-@pytest.mark.parametrize(
-    ("parts", "what"),
-    [
-        (chain_of(40), "40 joints; a robot has at most 32; choose a part"),
-        ((link("a"), link("b", mass=1e300), joint("j", "a", "b")), "joints.j: a body beyond"),
-    ],
-)
-def test_what_cannot_be_read_is_one_line(parts: tuple[str, ...], what: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=what) as caught:
-        check_device(device_of(tmp_path, parts=parts))
-    assert not caught.value.others and "\n" not in str(caught.value)
-
-
 def test_limits_below_zero_are_unknown_and_no_urdf_lies_outside_the_folder(tmp_path: Path) -> None:
     parts = (link("a"), link("b"), joint("j", "a", "b"))
     parts = tuple(part.replace('effort="40"', 'effort="-40"') for part in parts)
@@ -209,28 +196,32 @@ def test_motors_by_current_have_torque_constants(tmp_path: Path) -> None:
     assert parameters["torque_constant_two"].fixed
 
 
-@pytest.mark.parametrize(
-    ("tables", "what"),
-    [
-        ("[robot.motors.one]\nturns = { wrist = 1.0 }\n", "there is no joint 'wrist'"),
-        ("[robot.motors.one]\nturns = {}\n", "at least 1"),
-        (
-            "[robot.motors.one]\nturns = { elbow = 1.0 }\ntorque_constant = 1.0\n"
-            "[robot.motors.two]\nturns = { shoulder_pan = 1.0 }\n",
-            "some motors have a torque_constant, others do not",
-        ),
-        (
-            "[robot.motors.one]\nturns = { elbow = 1.0 }\ntorque_constant = 1.0\n"
-            "torque_constant_sd = 0.1\n[robot.motors.two]\nturns = { shoulder_pan = 1.0 }\n"
-            "torque_constant = 1.0\ntorque_constant_sd = 0.2\n",
-            "every torque constant is estimated, so the scale of all masses is undetermined",
-        ),
-        ("[robot.payload]\ncenter = [0.0, 0.0, 0.1]\n", "'mass' is missing"),
-    ],
+MOTORS = (
+    "[robot.motors.one]\nturns = {{ elbow = 1.0 }}\ntorque_constant = 1.0\n{}"
+    "[robot.motors.two]\nturns = {{ shoulder_pan = 1.0 }}\n{}"
 )
-def test_wrong_motors_and_payloads_are_refused(tables: str, what: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=what):
-        device_of(tmp_path, tables)
+SD = "torque_constant_sd = 0.1\n"
+
+
+@pytest.mark.parametrize(
+    ("tables", "parts", "what"),
+    [
+        ("[robot.motors.one]\nturns = { wrist = 1.0 }\n", ARM, "there is no joint 'wrist'"),
+        ("[robot.motors.one]\nturns = {}\n", ARM, "at least 1"),
+        (MOTORS.format("", ""), ARM, "some motors have a torque_constant, others do not"),
+        (MOTORS.format(SD, f"torque_constant = 1.0\n{SD}"), ARM,
+         "every torque constant is estimated, so the scale of all masses is undetermined"),
+        ("[robot.payload]\ncenter = [0.0, 0.0, 0.1]\n", ARM, "'mass' is missing"),
+        ("", chain_of(40), "40 joints; a robot has at most 32; choose a part"),
+        ("", (link("a"), link("b", mass=1e300), joint("j", "a", "b")), "joints.j: a body beyond"),
+    ],
+)  # fmt: skip
+def test_wrong_robots_motors_and_payloads_are_refused_in_one_line(
+    tables: str, parts: tuple[str, ...], what: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=what) as caught:
+        check_device(device_of(tmp_path, tables, parts))
+    assert not caught.value.others and "\n" not in str(caught.value)
 
 
 def test_a_table_of_denavit_and_hartenberg_is_the_same_robot(tmp_path: Path) -> None:

@@ -220,8 +220,7 @@ def test_a_process_that_hangs_while_compiling_is_not_waited_for_without_end(
 
 
 @pytest.fixture
-def model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Model:
-    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "cache"))
+def model(cached: Path) -> Model:
     return Model(registry.device("slider"), ("quadratic_drag:carriage",))
 
 
@@ -236,21 +235,18 @@ def inertia(system: System) -> float:
 @pytest.mark.parametrize("name", ["", "_whole"])
 @pytest.mark.parametrize("content", [b"", b"\x00\xff import os", b'{"facts": {', b"[]"])
 def test_damaged_generated_code_is_generated_again(
-    model: Model, tmp_path: Path, name: str, content: bytes
+    model: Model, cached: Path, name: str, content: bytes
 ) -> None:
     right = inertia(compile_model(model))
-    (path,) = (tmp_path / "cache").rglob(f"model_{model.key}{name}.json")
+    (path,) = cached.rglob(f"model_{model.key}{name}.json")
     sound = path.read_bytes()
     path.write_bytes(content)
     assert inertia(compile_model(model)) == right
     assert path.read_bytes() == sound
 
 
-def test_the_memory_of_an_effect_is_compiled_once_for_all_joints(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_memory_of_an_effect_is_compiled_once_for_all_joints(cached: Path) -> None:
     """Its text knows columns by number only; on either axis it uses its own."""
-    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "cache"))
     device = registry.device("bam")
     axes = tuple(c.name for c in device.coordinates)[:2]
     systems = [compile_model(Model(device, (f"presliding:{axis}",))) for axis in axes]

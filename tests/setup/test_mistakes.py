@@ -82,33 +82,45 @@ def inspect_session(root: Path) -> SetupResult:
     return SetupResult.read(run.root / "filter/setup.json")
 
 
-def test_a_scale_of_one_is_said_even_where_nothing_contradicts_it(tmp_path: Path) -> None:
-    """As where torques are counted in amperes: priors that fit it, a source that owns up to it."""
-    amperes = (
-        set_text("value = 10.0", "value = 1.0", "joint.toml"),
-        set_text(r"prior = (\d+)\.0, sd = (\d+)\.0", r"prior = \1e-1, sd = \2e-1", "joint.toml"),
-    )
-    found = inspected(tmp_path, *amperes)
-    assert found.mistakes == ()
-    (line,) = list_setup_faults(found)
-    assert line.startswith("torque_per_ampere of the device file is 1 N.m/A, source 'data sheet'")
+def stop(folder: Path) -> None:
+    for file in folder.glob("trials/*.csv"):
+        frame = pd.read_csv(file)
+        frame.loc[frame["t"] > 0.6, "q"] = frame["q"].iloc[55]
+        frame.to_csv(file, index=False)
 
 
-def test_an_axis_that_hardly_moves_is_said(tmp_path: Path) -> None:
-    def stop(folder: Path) -> None:
-        for file in folder.glob("trials/*.csv"):
-            frame = pd.read_csv(file)
-            frame.loc[frame["t"] > 0.6, "q"] = frame["q"].iloc[55]
-            frame.to_csv(file, index=False)
+AMPERES = (
+    set_text("value = 10.0", "value = 1.0", "joint.toml"),
+    set_text(r"prior = (\d+)\.0, sd = (\d+)\.0", r"prior = \1e-1, sd = \2e-1", "joint.toml"),
+)
+WEIGHTLESS = (
+    set_text(r'potential = ".*"', 'potential = "0"', "joint.toml"),
+    set_text(r"moment\w* = .*\n", "", "joint.toml"),
+)
 
-    found = inspected(tmp_path, stop)
-    assert found.axes["joint"].state == "hardly_moves"
-    lines = list_setup_faults(found)
-    assert any(line.startswith("joint hardly moves: it stands still in") for line in lines)
+
+@pytest.mark.parametrize(
+    ("machine", "changes", "state", "said"),
+    [
+        # Torques in amperes: nothing contradicts priors that fit, and a source that owns up to it.
+        ("joint", AMPERES, "sound", r"torque_per_ampere .* is 1 N.m/A, source 'data sheet'"),
+        # Its current follows position, and is none.
+        ("joint", WEIGHTLESS, "unexplained", "a torque that follows the position of joint"),
+        ("axis", (mistakes.hold_even,), "unexplained", "carriage: the bare device explains"),
+        ("joint", (stop,), "hardly_moves", "joint hardly moves: it stands still in"),
+    ],
+    ids=["scale of one", "no weight", "hardly follows", "hardly moves"],
+)
+def test_a_doubt_is_said_where_no_mistake_is_found(
+    machine: str, changes: Sequence[Callable[[Path], None]], state: str, said: str, tmp_path: Path
+) -> None:
+    found = inspected(tmp_path, *changes, machine=machine)
+    (axis,), (line,) = found.axes.values(), list_setup_faults(found)
+    assert found.mistakes == () and axis.state == state and re.match(said, line)
+    assert [*found.unexplained.values()] == [line] * (state == "unexplained")
 
 
 def test_an_axis_that_moves_beyond_reason_is_said(tmp_path: Path) -> None:
-    """A weightless joint in degrees: with all sizes free, nothing but the travel contradicts it."""
     found = inspected(tmp_path, mistakes.scale_column("q", 180.0 / np.pi))
     doubt = r"joint moves through .* see whether its position is in degrees"
     assert any(re.match(doubt, line) for line in list_setup_faults(found))
@@ -171,23 +183,6 @@ def test_trials_with_a_sign_of_their_own_are_named_and_taken_in(
         if factor < 0
     ]
     assert inspected(tmp_path / "taken", turn, *entries, machine=machine).mistakes == ()
-
-
-def test_what_hardly_follows_the_force_is_not_called_sound(tmp_path: Path) -> None:
-    found = inspected(tmp_path, mistakes.hold_even, machine="axis")
-    assert found.axes["carriage"].state == "unexplained"
-    assert list_setup_faults(found) == [line := found.unexplained["carriage"]]
-    assert line.startswith("carriage: the bare device explains")
-
-
-def test_gravity_that_the_device_lacks_is_no_exchanged_column(tmp_path: Path) -> None:
-    """A pendulum whose device file has no weight: its current follows position, and is none."""
-    weightless = set_text(r'potential = ".*"', 'potential = "0"', "joint.toml")
-    no_moments = set_text(r"moment\w* = .*\n", "", "joint.toml")
-    found = inspected(tmp_path, weightless, no_moments)
-    assert found.mistakes == ()
-    assert list_setup_faults(found) == [line := found.unexplained["joint"]]
-    assert line.startswith("a torque that follows the position of joint")
 
 
 def test_a_gear_that_was_left_out_is_found_whatever_its_reduction(tmp_path: Path) -> None:

@@ -110,20 +110,6 @@ def find_mistakes(given: list[Motion]) -> tuple[Finding, ...]:
     return search_in(given).find_mistakes()
 
 
-@pytest.mark.parametrize("viscous", [2.0, 9.0])
-def test_much_friction_is_no_mistake_of_units(viscous: float) -> None:
-    assert find_mistakes(motions(1.0, viscous)) == ()
-
-
-def test_torques_of_another_unit_are_told_from_reductions_known_badly() -> None:
-    """Bodies come out wrong in shape, more in what few motions show than their spread says."""
-    gears = np.array([1.1, 1.0, 1.0, 0.9])
-    assert find_mistakes([counted(m, gears) for m in motions(1.0, 9.0)]) == ()
-    (found,) = find_mistakes(motions(4.0, 2.0))
-    assert found.correction.kind == "scale" and len(found.correction.signals) == 4
-    assert found.correction.factor == pytest.approx(0.25)
-
-
 @pytest.mark.parametrize(("third", "named"), [(0.34, False), (0.18, True)])
 def test_what_spoils_a_joint_that_was_right_is_no_mistake(third: float, named: bool) -> None:
     """A counterbalance that the device lacks made all drives of a measured arm look halved."""
@@ -164,21 +150,36 @@ def test_a_drive_that_reads_nothing_explains_no_motion() -> None:
     assert held is not None and (held.left > 0.5).tolist() == [False, True, False, False]
 
 
-@pytest.mark.parametrize(
-    ("given", "named"),
-    [
-        (turned(1.0, 0.0, 0, 1.0), []),
-        (turned(1.0, 0.0, 1, -1.0), [("sign", ("torque_two",), 0.0)]),
-        (turned(1.0, 0.5 * np.pi, 1, 1.0), [("zero", ("two",), -0.5 * np.pi)]),
-        (turned(-1.0, 0.0, 2, 1.0), [("sign", ("three",), 0.0)]),
-    ],
-    ids=["sound", "drive reversed", "from the vertical", "encoder reversed"],
-)
-def test_what_free_bodies_take_on_is_found_with_bodies_as_drawn(
-    given: list[Motion], named: list[tuple[str, tuple[str, ...], float]]
-) -> None:
-    found = find_mistakes(given)
-    assert [(f.correction.kind, f.correction.signals, f.correction.offset) for f in found] == named
+GEARS = np.array([1.1, 1.0, 1.0, 0.9])
+Named = tuple[str, tuple[str, ...], object, float]
+"""Kind, signals, factor and offset of a mistake."""
+GIVEN: dict[str, tuple[list[Motion], list[Named]]] = {
+    "sound": (motions(1.0, 2.0), []),
+    "much friction": (motions(1.0, 9.0), []),
+    # Bodies come out wrong in shape, more in what few motions show than their spread says.
+    "reductions known badly": ([counted(m, GEARS) for m in motions(1.0, 9.0)], []),
+    "another unit": (motions(4.0, 2.0), [("scale", FORCES, pytest.approx(0.25), 0.0)]),
+    "drive reversed": (turned(1.0, 0.0, 1, -1.0), [("sign", ("torque_two",), -1.0, 0.0)]),
+    "from the vertical": (
+        turned(1.0, 0.5 * np.pi, 1, 1.0), [("zero", ("two",), 1.0, -0.5 * np.pi)]
+    ),
+    "encoder reversed": (turned(-1.0, 0.0, 2, 1.0), [("sign", ("three",), -1.0, 0.0)]),
+    # A reduction is none of a list.
+    "torque of the motor": (
+        turned(1.0, 0.0, 1, 1.0 / 70.0),
+        [("scale", ("torque_two",), pytest.approx(70.0, rel=0.25), 0.0)],
+    ),
+    "position of the motor": (
+        turned(70.0, 0.0, 0, 1.0), [("scale", ("one",), pytest.approx(1.0 / 70.0, rel=0.03), 0.0)]
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", GIVEN)
+def test_what_free_bodies_take_on_is_found_with_bodies_as_drawn(case: str) -> None:
+    given, named = GIVEN[case]
+    found = [finding.correction for finding in find_mistakes(given)]
+    assert [(one.kind, one.signals, one.factor, one.offset) for one in found] == named
 
 
 def test_two_joints_of_a_makers_zero_posture_are_found_together() -> None:
@@ -242,20 +243,6 @@ def test_a_heavy_tool_is_no_mistake_of_units(tool: float, factor: float | None) 
     else:
         assert search.heavier is not None and search.heavier.place == 3
         assert search.heavier.factor == pytest.approx(factor, rel=0.2)
-
-
-@pytest.mark.parametrize(
-    ("joint", "position", "torque", "named"),
-    [(1, 1.0, 1.0 / 70.0, ("torque_two",)), (0, 70.0, 1.0, ("one",))],
-    ids=["torque of the motor", "position of the motor"],
-)
-def test_a_reduction_follows_from_the_drives_and_is_none_of_a_list(
-    joint: int, position: float, torque: float, named: tuple[str, ...]
-) -> None:
-    (found,) = find_mistakes(turned(position, 0.0, joint, torque))
-    assert (found.correction.kind, found.correction.signals) == ("scale", named)
-    expected = 70.0 if position == 1.0 else 1.0 / 70.0
-    assert found.correction.factor == pytest.approx(expected, rel=0.25 if position == 1.0 else 0.03)
 
 
 @pytest.mark.parametrize(

@@ -34,11 +34,7 @@ def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
         if found == unit("Hz") and expected.si == "rad/s":  # turns a second
             found = unit("rev/s") or found
         if (found.si, found.scale) != (expected.si, expected.scale):
-            raise table.fault(
-                f"the file gives the unit {text}, session.toml {declared[column]}",
-                column=column,
-                remedy="correct session.toml",
-            )
+            raise table.fault("other_unit", column, unit=text, declared=declared[column])
 
 
 def fill_missing(table: TrialTable) -> None:
@@ -50,10 +46,10 @@ def fill_missing(table: TrialTable) -> None:
         return
     for name, missing in unknown.items():
         if missing.all():
-            raise table.fault("holds no number at all", column=name)
+            raise table.fault("no_number", name)
     sound = np.flatnonzero(~some)
     if len(sound) == 0:
-        raise table.fault("no row is complete")
+        raise table.fault("no_row")
     # Sensors that begin late or end early leave the rest as it is.
     start, stop = int(sound[0]), int(sound[-1]) + 1
     if (start > 0 or stop < len(table)) and 2 * (stop - start) >= len(table):
@@ -91,20 +87,10 @@ def _refuse_missing(table: TrialTable, name: str, missing: np.ndarray) -> None:
     whole = table.entry.kind == "locked"
     whole |= name in (e.column for e in table.session.encoders if e.integrate)
     if length > table.limits.nan_run and (whole or long > _MOST_MISSING * len(missing)):
-        raise table.fault(
-            f"{length} samples in a row are missing, more than {table.limits.nan_run}",
-            column=name,
-            at=start,
-            remedy="take a stretch without by start_s and end_s of its [[trials]] entry",
-        )
+        raise table.fault("missing_run", name, start, length=length, most=table.limits.nan_run)
     if count - long > max(table.limits.nan_share * len(missing), table.limits.nan_run):
-        raise table.fault(
-            f"{count} of {len(missing)} samples are missing,"
-            f" more than {table.limits.nan_share:.0%}",
-            column=name,
-            at=int(np.argmax(missing)),
-            remedy="find out why; to have them interpolated: --set ingest.nan_share=0.1",
-        )
+        of = {"count": count, "total": len(missing), "most": table.limits.nan_share}
+        raise table.fault("missing_share", name, int(np.argmax(missing)), **of)
 
 
 def refuse_frozen(table: TrialTable, column: str) -> None:
@@ -114,13 +100,8 @@ def refuse_frozen(table: TrialTable, column: str) -> None:
     share = (length + 1) / len(values)
     seconds = float(table.t[min(start + length, len(table) - 1)] - table.t[start])
     if share > table.limits.frozen_share and seconds > table.limits.shortest_s / 2:
-        raise table.fault(
-            f"reads {values[start]:g} without a change for {seconds:.3g} s ({share:.0%} of the"
-            " trial): frozen",
-            column=column,
-            at=start,
-            remedy="check the sensor's cable",
-        )
+        of = {"value": values[start], "seconds": seconds, "share": share}
+        raise table.fault("frozen", column, start, **of)
 
 
 def to_si(table: TrialTable) -> dict[str, np.ndarray]:
@@ -138,7 +119,7 @@ def to_si(table: TrialTable) -> dict[str, np.ndarray]:
     if session.force is not None:
         force = session.force
         for column, zero in zip(force.columns, force.zero, strict=True):
-            _refuse_wild(table, raw[column], f"reads {column}", column)
+            _refuse_wild(table, raw[column], "reads", column, column)
             raw[column] -= zero
         for name, gains in zip(force.names, force.calibration, strict=True):
             total = np.zeros(len(table))
@@ -160,7 +141,7 @@ def to_si(table: TrialTable) -> dict[str, np.ndarray]:
         si[channel.name] = values
         source[channel.name] = channel.column
     for name, values in si.items():
-        _refuse_wild(table, values, f"gives {name}", source[name])
+        _refuse_wild(table, values, "gives", name, source[name])
     return si
 
 
@@ -179,19 +160,11 @@ def to_signed(table: TrialTable, source: Channel | Encoder) -> None:
     if not any(register):
         return
     values = table.columns[source.column]
-    table.refuse(
-        (values < 0.0) | (values >= register.period),
-        lambda at: f"found {values[at]:g}, expected 0 to {register.period - 1.0:.0f}",
-        column=source.column,
-        remedy="a column that is signed already needs no wrap_bits and no sign_bit",
-    )
+    beyond = (values < 0.0) | (values >= register.period)
+    table.refuse("register", source.column, values, beyond, most=register.period - 1.0)
     table.columns[source.column] = register.signed(values)
 
 
-def _refuse_wild(table: TrialTable, values: np.ndarray, words: str, column: str) -> None:
-    table.refuse(
-        ~(np.abs(values) < LARGEST_VALUE),
-        lambda at: f"{words} = {values[at]:.3g}, which no such machine does",
-        column=column,
-        remedy="check the column and its calibration",
-    )
+def _refuse_wild(table: TrialTable, values: np.ndarray, verb: str, name: str, column: str) -> None:
+    wild = ~(np.abs(values) < LARGEST_VALUE)
+    table.refuse("beyond_machines", column, values, wild, verb=verb, name=name)

@@ -175,7 +175,7 @@ def time_to_seconds(table: TrialTable) -> None:
     if count:
         if count > _few(table, len(table)):
             at = int(np.argmax(missing))
-            raise table.fault(f"{count} time stamps are missing", column=table.clock, at=at)
+            raise table.fault("stamps_missing", table.clock, at, count=count)
         table.keep(~missing)
         table.repairs.append(f"{count_noun(count, 'row')} without a time stamp dropped")
     _unwrap_clock(table)
@@ -183,19 +183,11 @@ def time_to_seconds(table: TrialTable) -> None:
     steps = steps[steps > 0]
     if len(steps) == 0:
         falls = len(table) > 1 and table.t[-1] < table.t[0]
-        raise table.fault(
-            "time runs backwards throughout" if falls else "time stands still",
-            column=table.clock,
-            remedy="is this the time column?",
-        )
+        raise table.fault("time_falls" if falls else "time_stands", table.clock)
     room = float(np.spacing(np.median(np.abs(table.t))))
     if room > COARSEST_STAMP * float(np.median(steps)):
-        raise table.fault(
-            f"time stamps near {np.median(table.t):.3g} are rounded to {room:.3g}, at a median step"
-            f" of {np.median(steps):.3g}",
-            column=table.clock,
-            remedy="log the time from the start of the recording",
-        )
+        near, step = np.median(table.t), np.median(steps)
+        raise table.fault("stamps_rounded", table.clock, near=near, room=room, step=step)
     # The first stamp goes first: stamps since 1970 in s have no room for fractions of 1 us.
     table.t = (table.t - table.t[0]) * table.session.tick
     nominal = table.session.sample_rate
@@ -209,11 +201,7 @@ def time_to_seconds(table: TrialTable) -> None:
         words = f"in {real}, not {declared}" if real else f"wrong by a factor of 1e{power}"
         table.repairs.append(f"time stamps are {words}, by the nominal rate: converted")
     elif table.session.clock.unit != "samples" and not 0.1 < ratio < 10.0:
-        raise table.fault(
-            f"the median step of {ratio / nominal:.3g} s does not fit sample_rate_hz = {nominal:g}",
-            column=table.clock,
-            remedy="check the unit of the time column and sample_rate_hz",
-        )
+        raise table.fault("other_rate", table.clock, step=ratio / nominal, rate=nominal)
 
 
 def _unwrap_clock(table: TrialTable) -> None:
@@ -285,13 +273,9 @@ def drop_backward_stamps(table: TrialTable) -> None:
     behind = np.concatenate([[False], t[1:] < before])
     counts = int(repeated.sum()), int(behind.sum())
     if sum(counts) > _few(table, total):
-        what = f"{counts[0]} of {total} time stamps are repeated"
-        remedy = 'log them more finely; of evenly sampled rows, [time] unit = "samples" counts'
-        if counts[1] > counts[0]:
-            what = f"time runs backwards: {counts[1]} of {total} stamps are not after those before"
-            remedy = "is this the time column? recordings of one file go into files of their own"
+        name = "stamps_behind" if counts[1] > counts[0] else "stamps_repeated"
         at = int(np.argmax(repeated | behind))
-        raise table.fault(what, column=table.clock, at=at, remedy=remedy)
+        raise table.fault(name, table.clock, at, count=max(counts), total=total)
     table.keep(~(repeated | behind))
     faults = "a repeated time stamp", "a time stamp out of order"
     for count, what in zip(counts, faults, strict=True):
@@ -307,10 +291,7 @@ def cut_stretch(table: TrialTable) -> None:
     t = table.t - table.t[0]
     inside = (t >= start) & (t < end)
     if not inside.any():
-        raise table.fault(
-            f"start_s = {start:g} is after the last sample, at {t[-1]:.3f} s of the record",
-            column=table.clock,
-        )
+        raise table.fault("starts_after", table.clock, start=start, last=t[-1])
     table.keep(inside)
     until = f"{end:g}" if end <= t[-1] else f"{t[-1]:.3f}"
     table.notes.append(f"from {start:g} to {until} s of the record")
@@ -330,12 +311,8 @@ def keep_longest_stretch(table: TrialTable) -> None:
     share = (stop - start) / len(table)
     words = f"{count_noun(len(gaps), 'gap')} of up to {steps.max():.3g} s in the time stamps"
     if share < table.limits.sound_share:
-        raise table.fault(
-            f"{words}, and the longest stretch between them holds {share:.0%} of the samples,"
-            f" less than {table.limits.sound_share:.0%}",
-            column=table.clock,
-            at=int(gaps[0]),
-        )
+        of = {"gaps": words, "share": share, "least": table.limits.sound_share}
+        raise table.fault("gaps", table.clock, int(gaps[0]), **of)
     first, last = table.rows[start], table.rows[stop - 1]
     dropped = count_noun(len(table) - (stop - start), "row")
     table.keep(slice(start, stop))
@@ -347,17 +324,11 @@ def refuse_length(table: TrialTable) -> None:
     # Each sample stands for one step: 500 samples at 500 Hz are 1 s.
     step = float(np.median(np.diff(table.t))) if len(table) > 1 else 0.0
     duration = float(table.t[-1]) + step
+    of = {"samples": count_noun(len(table), "sample"), "seconds": duration}
     if len(table) < 4 or duration < table.limits.shortest_s * (1 - 1e-6):
-        raise table.fault(
-            f"{count_noun(len(table), 'sample')} over {duration:.3g} s,"
-            f" less than {table.limits.shortest_s:g} s"
-        )
+        raise table.fault("too_short", **of, least=table.limits.shortest_s)
     if duration > LONGEST_TRIAL_S:
-        raise table.fault(
-            f"{count_noun(len(table), 'sample')} over {duration:.3g} s, which is more than a year",
-            column=table.clock,
-            remedy="check the unit of the time column and sample_rate_hz",
-        )
+        raise table.fault("too_long", table.clock, **of)
 
 
 def rate_of(t: np.ndarray) -> float:

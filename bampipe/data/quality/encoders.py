@@ -1,6 +1,7 @@
 """Encoder readings: whole counts, no wraps, no jumps; and motion as the kind of trial has it."""
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import median_filter
 
 from bampipe.arrays import Array, Indices
@@ -24,12 +25,7 @@ def refuse_fractions(table: TrialTable, encoder: Encoder) -> None:
         return
     values = table.columns[encoder.column]
     fractions = np.isfinite(values) & (values != np.rint(values))
-    table.refuse(
-        fractions,
-        lambda at: f"found {values[at]:g}, expected whole counts",
-        column=encoder.column,
-        remedy="columns swapped? or already in units (then leave counts_per_unit out)",
-    )
+    table.refuse("fractions", encoder.column, values, fractions)
 
 
 def integrate(table: TrialTable, encoder: Encoder) -> None:
@@ -40,13 +36,9 @@ def integrate(table: TrialTable, encoder: Encoder) -> None:
     """
     if not encoder.integrate:
         return
-    table.columns[encoder.column] = integral(table.t, table.columns[encoder.column])
+    rate = table.columns[encoder.column]
+    table.columns[encoder.column] = cumulative_trapezoid(rate, table.t, initial=0.0)
     table.notes.append(f"position is the integral of the velocity '{encoder.column}', from 0")
-
-
-def integral(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Position (T,) from 0 by trapezia, of a velocity (T,) at ``t`` (T,), s."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t))])
 
 
 def unwrap(table: TrialTable, encoder: Encoder) -> None:
@@ -126,14 +118,8 @@ def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:
     if len(lasting) or wild.sum() > table.limits.nan_share * total:
         at = int(lasting[0] if len(lasting) else jumps[0])
         size = abs(values[at + 1] - values[at]) * abs(encoder.scale)
-        raise table.fault(
-            f"jumps by {size:.3g} {encoder.unit} from one sample to the next "
-            f"({in_times(len(jumps))})",
-            column=encoder.column,
-            at=at + 1,
-            remedy="counts lost, or the counter was reset: take one side of it, by start_s or"
-            f" end_s = {table.t[at + 1]:.4g} in [[trials]]",
-        )
+        of = {"size": size, "unit": encoder.unit, "times": in_times(len(jumps))}
+        raise table.fault("jumps", encoder.column, at + 1, **of, t=table.t[at + 1])
     take_out(table, encoder.column, wild)
     fill_missing(table)
 
@@ -146,7 +132,8 @@ def check_velocity(table: TrialTable, encoder: Encoder) -> None:
     position = (table.columns[encoder.column] - encoder.zero) * encoder.scale
     # Distances over short stretches: as moved, and as expected by the velocity.
     every = max(1, round(_WINDOW_S / float(np.median(np.diff(table.t)))))
-    moved, expected = (np.diff(x[::every]) for x in (position, integral(table.t, speed)))
+    reached = cumulative_trapezoid(speed, table.t, initial=0.0)
+    moved, expected = (np.diff(x[::every]) for x in (position, reached))
     size = float(moved @ moved), float(expected @ expected)
     if len(moved) < 10 or not all(size):
         return
@@ -160,11 +147,7 @@ def check_velocity(table: TrialTable, encoder: Encoder) -> None:
         )
         return
     if not 1 / VELOCITY_RATIO < ratio < VELOCITY_RATIO:
-        raise table.fault(
-            f"is {ratio:.3g} times the change of '{encoder.column}'",
-            column=column,
-            remedy="check the units and signs of both in session.toml",
-        )
+        raise table.fault("other_velocity", column, ratio=ratio, position=encoder.column)
     if not 0.95 < ratio < 1.05:
         table.notes.append(f"'{column}' is {ratio:.3g} times the change of '{encoder.column}'")
 
@@ -177,35 +160,23 @@ def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> No
     if entry.kind != "locked":
         if all(travel[e.name] < still[e.unit] for e in session.encoders):
             shown = ", ".join(f"{e.name} {travel[e.name]:.2g} {e.unit}" for e in session.encoders)
-            raise table.fault(
-                f"declared {entry.kind}, but never moves ({shown})",
-                remedy="were the encoders on, and is their unit right? or is it a locked trial? if"
-                " the machine moves no further, lower still_m or still_rad in [settings.ingest]",
-            )
+            raise table.fault("never_moves", kind=entry.kind, shown=shown)
         for encoder in session.encoders:
             if travel[encoder.name] == 0.0:
-                said, remedy = "never changes while other axes move", "check the encoder's cable"
                 if not limits.held_axes:
-                    raise table.fault(f"{said}: frozen", column=encoder.column, remedy=remedy)
+                    raise table.fault("axis_frozen", encoder.column)
+                said = "never changes while other axes move"
                 table.notes.append(f"column '{encoder.column}' {said}: is {encoder.name} held?")
         return
     encoder = next(e for e in session.encoders if e.name == entry.locked_axis)
     most = {"rad": limits.locked_rad, "m": limits.locked_m}[encoder.unit]
     moved = travel[encoder.name]
     if moved > most:
-        raise table.fault(
-            f"{encoder.name} is declared locked, but moves by {moved:.3g} {encoder.unit},"
-            f" more than {most:g} {encoder.unit}",
-            column=encoder.column,
-            remedy="did the brake slip? or is it a free trial?",
-        )
+        of = {"axis": encoder.name, "moved": moved, "unit": encoder.unit, "most": most}
+        raise table.fault("locked_moves", encoder.column, **of)
     if encoder.resolution is not None and moved < (limits.locked_steps - 0.5) * encoder.resolution:
         steps = count_noun(round(moved / encoder.resolution), "encoder step")
-        raise table.fault(
-            f"locked {encoder.name} deflects by {steps} only, too little for a stiffness",
-            column=encoder.column,
-            remedy="was another axis loaded? are the columns right?",
-        )
+        raise table.fault("locked_still", encoder.column, axis=encoder.name, steps=steps)
 
 
 def refuse_wrong_brakes(table: TrialTable, columns: dict[str, np.ndarray]) -> None:
@@ -214,18 +185,11 @@ def refuse_wrong_brakes(table: TrialTable, columns: dict[str, np.ndarray]) -> No
     highest = {b.axis: float(np.abs(columns[f"brake_{b.axis}"]).max()) for b in brakes}
     for brake in brakes:
         if entry.kind == "free" and highest[brake.axis] > table.limits.brake_on:
-            raise table.fault(
-                f"declared free, but the brake is commanded up to {highest[brake.axis]:.3g}"
-                f" {brake.unit}",
-                column=brake.column,
-                remedy='is its kind "locked" or "viscous"?',
-            )
+            of = {"highest": highest[brake.axis], "unit": brake.unit}
+            raise table.fault("free_braked", brake.column, **of)
         if brake.axis == entry.locked_axis and highest[brake.axis] == 0.0:
             table.notes.append(f"brake of the locked axis {brake.axis} is never commanded")
     if entry.kind == "viscous" and not brakes:
-        raise table.fault(
-            "declared viscous, but no brake command is recorded",
-            remedy="name the columns of the commands under [brakes] in session.toml",
-        )
+        raise table.fault("no_commands")
     if entry.kind == "viscous" and not any(highest.values()):
-        raise table.fault("declared viscous, but no brake is ever commanded")
+        raise table.fault("never_commanded")

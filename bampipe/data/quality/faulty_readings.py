@@ -198,12 +198,8 @@ def leave_out_rails(table: TrialTable) -> None:
         said = f"{share:.1%} of the samples stand at the rail {where}"
         most = limits.saturated_share if table.entry.kind == "locked" else _MOST_AT_RAILS
         if column in volts and share > most:
-            raise table.fault(
-                f"{said}: saturated, more than {most:.0%}",
-                column=column,
-                at=int(np.argmax(np.any(list(rails.values()), axis=0))),
-                remedy="lower the gain or the load",
-            )
+            at = int(np.argmax(np.any(list(rails.values()), axis=0)))
+            raise table.fault("saturated", column, at, said=said, most=most)
         in_steps = len(np.unique(values)) < _FEWEST_LEVELS and column not in volts
         if not _LEAST_AT_RAILS <= share <= _MOST_AT_RAILS or in_steps:
             continue
@@ -263,12 +259,7 @@ def refuse_new_zero(table: TrialTable) -> None:
         gain = along**2 / np.maximum(np.arange(len(rest), 0, -1) - np.square(own).sum(axis=0), 1.0)
         at, left = every * (int(np.argmax(gain)) + inner.start), float(rest @ rest)
         if gain.max() > _ONE_STEP * left and left > _MATTERS * values.size * np.var(values):
-            raise table.fault(
-                "jumps and stays there, whatever the motion: zeroed anew, or another load",
-                column=column,
-                at=at,
-                remedy=f"cut it there, by end_s and start_s = {table.t[at]:.4g} in [[trials]]",
-            )
+            raise table.fault("new_zero", column, at, t=table.t[at])
 
 
 def _beyond(

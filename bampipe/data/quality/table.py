@@ -1,6 +1,6 @@
 """A trial while it is being cleaned, the limits of a sound one, and the thinning of it."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -8,6 +8,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import find_runs
 from bampipe.data.readers.trial import RawTrial
+from bampipe.data.refusals import refusal
 from bampipe.data.session import Session, TrialEntry
 from bampipe.errors import InputError
 from bampipe.results.ingest import DeadStretch
@@ -125,20 +126,20 @@ class TrialTable:
             self.columns[name] = self.columns[name][which].copy()
 
     def fault(
-        self, what: str, *, column: str = "", at: int | None = None, remedy: str = ""
+        self, name: str, column: str = "", at: int | None = None, /, **known: object
     ) -> InputError:
-        """The error to raise, with file, row and column."""
+        """The error called ``name`` in ``refusals.toml``, with file, row and column."""
         row = "" if at is None else f", row {self.rows[at]}"
         where = f"{self.entry.file}{row}" + (f", column '{column}'" if column else "")
-        return InputError(what, where=where, remedy=remedy)
+        return refusal(name, where, **known)
 
     def refuse(
-        self, wrong: np.ndarray, words: Callable[[int], str], *, column: str, remedy: str
+        self, name: str, column: str, values: np.ndarray, wrong: np.ndarray, /, **known: object
     ) -> None:
-        """Raise :meth:`fault` at the first row that is ``wrong``, (T,), if there is one."""
+        """Raise `fault` at the first of ``values``, (T,), that is ``wrong``, (T,), if any is."""
         if wrong.any():
             at = int(np.argmax(wrong))
-            raise self.fault(words(at), column=column, at=at, remedy=remedy)
+            raise self.fault(name, column, at, value=values[at], **known)
 
 
 def longest_run(which: np.ndarray) -> tuple[int, int]:

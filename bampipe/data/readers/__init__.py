@@ -18,6 +18,7 @@ from types import ModuleType
 
 from bampipe.data.readers import arrays, bag, hdf5, mat, objects, parquet, tdms, text
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
+from bampipe.data.refusals import refusal
 from bampipe.data.units import unit, units_in
 from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError, located
@@ -32,8 +33,8 @@ Reader = ModuleType | arrays.ArrayReader
 _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     (TEXTS, text, "", ""),
     (SHEETS, text, "workbook of Excel", "save it again, or export the sheet as CSV"),
-    ((".parquet",), parquet, "Parquet file", _AGAIN),
-    ((".feather", ".arrow"), parquet, "Feather file", _AGAIN),
+    ((".parquet",), parquet.READER, "Parquet file", _AGAIN),
+    ((".feather", ".arrow"), parquet.READER, "Feather file", _AGAIN),
     ((".mat",), mat.READER, "MATLAB file", "save it again from MATLAB"),
     (hdf5.ENDINGS, hdf5.READER, "HDF5 file", _AGAIN),
     (_OBJECTS, objects.READER, "", ""),
@@ -156,10 +157,7 @@ def _safely(path: Path) -> Iterator[None]:
     try:
         yield
     except MemoryError as error:
-        raise InputError(
-            "does not fit into memory",
-            remedy="is it damaged? else split it, or export the columns that are wanted",
-        ) from error
+        raise refusal("no_memory") from error
     except InputError:
         raise
     except Exception as error:
@@ -187,10 +185,7 @@ def _reader(path: Path) -> Reader:
     except OSError as error:
         raise InputError(f"cannot be read: {(error.strerror or 'error').lower()}") from error
     if not is_log(path):
-        raise InputError(
-            f"unsupported file extension '{extension}'",
-            remedy=f"supported are {', '.join(EXTENSIONS)}, and text with rows of numbers",
-        )
+        raise refusal("unsupported", extension=extension, known=", ".join(EXTENSIONS))
     if state.st_size == 0:
         raise InputError("the file is empty")
     if head[512:520] == hdf5.SIGNATURE:  # behind a user block of MATLAB

@@ -19,6 +19,7 @@ import numpy as np
 
 from bampipe.data.readers import moments, trial
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.data.refusals import refusal
 from bampipe.data.units import SCALES, in_steps, units_beside, units_in
 from bampipe.data.vocabulary import word_set
 from bampipe.errors import InputError, located
@@ -102,7 +103,9 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
     own = [c for c in wanted.columns if at_one_rate.get(c) is not arrays.get(c)]
     said = f"interpolated linearly at the times of the longest: {join_names(own)}"
     remarks = (said,) if own else ()
-    return RawTrial(aligned(values, what), 1, remarks=remarks, units=units, begun=starts)
+    columns = aligned(values, what)
+    rows = np.arange(1, 1 + len(next(iter(columns.values()), ())))
+    return RawTrial(columns, rows, remarks=remarks, units=units, begun=starts)
 
 
 def _read_column(array: Stored, index: int | None, form: str | None) -> np.ndarray:
@@ -110,10 +113,7 @@ def _read_column(array: Stored, index: int | None, form: str | None) -> np.ndarr
     if form is not None and array.kind in _NUMBERS:
         raise InputError("not text, expected dates and times")
     if form is None and array.kind in _STAMPED:
-        raise InputError(
-            "not numbers, but dates and times or text",
-            remedy='is it the time? then say unit = "datetime" under [time]',
-        )
+        raise refusal("no_numbers")
     cells = pick(array.load(), index)
     if form is None:
         return np.array(cells, dtype=np.float64)  # a copy: what stands in a file is not written to
@@ -132,11 +132,7 @@ def _fault(variable: str, known: Arrays, where: str) -> InputError:
         return InputError("a link, expected numbers in this file", where=where)
     if variable not in known:
         check_columns(list(known), [variable])
-    return InputError(
-        "not numbers, expected a vector of real numbers",
-        where=where,
-        remedy="save it as a numeric array: cells, tables and objects are not",
-    )
+    return refusal("no_vector", where)
 
 
 def columns_of_arrays(arrays: Arrays) -> dict[str, str]:
@@ -355,15 +351,18 @@ class ArrayReader:
         what: an array of such a file is called in messages.
         opened: what a file holds, while it is open, and what was left out, a sentence each; for
             what is wanted of it, or to list it.
+        begun: samples from which on another recording stands in a file without runs.
     """
 
     what: str
     opened: Callable[[Path, Wanted | None], AbstractContextManager[Opened]]
+    begun: Callable[[Path], tuple[int, ...]] = lambda path: ()
 
     def read(self, path: Path, wanted: Wanted) -> RawTrial:
         """The wanted columns; `InputError` as `read_arrays`, or where the file is damaged."""
         with self.opened(path, wanted) as (arrays, notes):
-            return replace(read_arrays(arrays, wanted, self.what), notes=notes)
+            trial = read_arrays(arrays, wanted, self.what)
+            return replace(trial, notes=notes, begun=trial.begun or self.begun(path))
 
     def columns(self, path: Path) -> dict[str, str]:
         """Names and units of the columns that were recorded together; see `columns_of_arrays`."""
@@ -378,10 +377,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         loaded = np.load(path, allow_pickle=False)
         whole = {"data": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
     except ValueError as error:
-        raise InputError(
-            "not sound, or pickled Python objects, which are not read",
-            remedy="save arrays of numbers: np.savez(FILE, t=t, q=q, tau=tau)",
-        ) from error
+        raise refusal("pickled") from error
     found: dict[str, Stored] = {}
     units = units_beside({x: str(a.ravel()[0]) for x, a in whole.items() if a.size == 1})
     for key, array in whole.items():
@@ -392,11 +388,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         (name, array.shape) for name, array in found.items() if len(labels("", array.shape)) == 0
     ]
     if wanted is None and blocks and len(blocks) == len(sampled):
-        name, shape = blocks[0]
-        raise InputError(
-            f"'{name}' is a {_by(shape)} array, of which no side is said to be the samples",
-            remedy="save each trial as an array of its own, samples by channels",
-        )
+        raise refusal("block", name=blocks[0][0], shape=_by(blocks[0][1]))
     yield found, ()
 
 

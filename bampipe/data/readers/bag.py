@@ -24,6 +24,7 @@ import numpy as np
 from bampipe.data.readers import moments, trial
 from bampipe.data.readers.nested import MISSING, as_number, find, items, leaves, names_in, spread
 from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size, need
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError
 
 RECORDED = "@time"
@@ -79,11 +80,7 @@ class _Stream:
         known = [moment for moment in self.stamped if moment is not None]
         lost = len(self.stamped) - len(known)
         if lost and leads and clock.path == STAMP:
-            raise InputError(
-                f"{lost} messages have no {STAMP}",
-                where=f"topic {clock.topic}",
-                remedy=f"give {clock.topic}:{RECORDED} under [time]",
-            )
+            raise refusal("no_stamp", f"topic {clock.topic}", lost=lost, topic=clock.topic)
         stamps = known if clock.path == STAMP and not lost else self.recorded
         times, counts = np.array(stamps, dtype=np.int64), np.array(self.counts)
         if len(counts) < 2 or counts.max() == 1:
@@ -104,11 +101,7 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
     clock_column, clock = next(iter(fields.items()))
     streams = _read_streams(path, fields, wanted)
     if not (clock.is_time or "[:]" in clock.path or "::" in clock.path):
-        raise InputError(
-            "is no time",
-            where=f"column '{clock_column}'",
-            remedy=f"give {clock.topic}:{RECORDED} or {clock.topic}:{STAMP} under [time]",
-        )
+        raise refusal("no_time", f"column '{clock_column}'", topic=clock.topic)
     # The stream that has most of the columns, then most messages, comes first.
     ranked = sorted(streams, key=lambda s: (-len(s.cells), -len(s.recorded)))
     of = {c: next(s for s in ranked if c in s.cells) for c, f in fields.items() if not f.is_time}
@@ -135,7 +128,7 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
                 f"{stream.topic} interpolated linearly at the times of {clock.topic}"
                 f" (at most {gap:.3g} s between its messages)"
             )
-    return RawTrial(values, first_row=1, remarks=tuple(filter(None, remarks)))
+    return RawTrial(values, np.arange(1, 1 + len(base)), remarks=tuple(filter(None, remarks)))
 
 
 def _read_streams(path: Path, fields: Mapping[str, Field], wanted: Wanted) -> list[_Stream]:
@@ -217,10 +210,7 @@ def _stamp(message: Any) -> int | None:
 def _field(column: str) -> Field:
     topic, colon, path = column.partition(":")
     if not colon or not path:
-        raise InputError(
-            f"'{column}' does not say which field of which topic",
-            remedy="write /topic:field, as in /joint_states:position[0]",
-        )
+        raise refusal("no_field", column=column)
     return Field(topic, path)
 
 

@@ -8,8 +8,7 @@ Source: huggingface/lerobot, ``src/lerobot/datasets/utils.py``.
 """
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,29 +30,15 @@ _LATEST_S = 1.0
 """Longest lag behind a goal that is looked for."""
 
 
-@dataclass(frozen=True)
-class DataSet:
-    """A data set.
-
-    Attributes:
-        episodes: their numbers in each file, in the order of their rows, by its relative path.
-        chosen: numbers of those that are wanted.
-    """
-
-    episodes: Mapping[str, Sequence[int]]
-    chosen: frozenset[int]
-
-    def recordings(self, file: str) -> list[int]:
-        """The wanted episodes of a file by their places in it, from 1 on."""
-        return [k for k, number in enumerate(self.episodes[file], 1) if number in self.chosen]
-
-
-def open_dataset(folder: Path, episodes: str = "") -> DataSet | None:
-    """Return the data set in ``folder``; None if it is no data set of LeRobot.
+def find_episodes(folder: Path, episodes: str = "") -> dict[str, list[int]] | None:
+    """Find the wanted episodes of the data set in ``folder``; None if it is none of LeRobot.
 
     Args:
         folder: that holds ``meta`` and ``data``.
         episodes: those that are wanted, as ``0:20``, ``5:`` or ``7``; all where empty.
+
+    Returns:
+        By relative path of a file, their places in it, from 1 on; files without any are left out.
 
     Raises:
         InputError: no such episodes, no data, or a file is damaged; or ``episodes`` of a folder
@@ -79,13 +64,15 @@ def open_dataset(folder: Path, episodes: str = "") -> DataSet | None:
     if match is not None:
         first = int(match[3] or match[1] or 0)
         end = first + 1 if match[3] else int(match[2] or 1 + max(known, default=-1))
-    chosen = frozenset(number for number in known if first <= number < end)
-    if not chosen:
+    places = {
+        file: [k for k, number in enumerate(numbers, 1) if first <= number < end]
+        for file, numbers in found.items()
+    }
+    if not any(places.values()):
         what = f"no episode {episodes}" if episodes else "no episode in data/*/*.parquet"
         remedy = f"it has {known[0]} to {known[-1]}: --episodes 0:20" if known else ""
         raise InputError(what, where=str(folder), remedy=remedy)
-    kept = {file: numbers for file, numbers in found.items() if chosen & {*numbers}}
-    return DataSet(kept, chosen)
+    return {file: own for file, own in places.items() if own}
 
 
 def episodes_begin(path: Path) -> tuple[int, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from bampipe.data.readers import hdf5
 from bampipe.data.readers.arrays import ArrayReader, Opened, Stored, called_signals, stored
 from bampipe.data.readers.trial import Wanted
-from bampipe.errors import InputError
+from bampipe.data.refusals import refusal
 
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
@@ -30,11 +30,7 @@ _MOST_FIELDS = 4096
 def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     """The variables of a file; ``S.q`` is a field of ``S``. InputError of another version."""
     for column in wanted.datetimes if wanted else ():
-        raise InputError(
-            "dates and times of MATLAB are not read",
-            where=f"variable '{column}'",
-            remedy="save seconds: t = seconds(stamp - stamp(1))",
-        )
+        raise refusal("matlab_moments", f"variable '{column}'")
     if _is_level_5(path):
         arrays, root = _arrays(path)
         whole = {f"{root}{label}": array for label, array in arrays.items()} if wanted else {}
@@ -65,9 +61,7 @@ def _is_level_5(path: Path) -> bool:
         return False
     if len(head) >= _HEADER and head[126:128] in (b"IM", b"MI"):
         return True
-    raise InputError(
-        "not a MATLAB file of version 5 or newer", remedy="save it again from MATLAB (-v7)"
-    )
+    raise refusal("old_matlab")
 
 
 def _arrays(path: Path) -> tuple[dict[str, Stored], str]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError
 
 NANOSECONDS = 1_000_000_000
@@ -66,11 +67,8 @@ def nanoseconds(values: Sequence[str | None] | np.ndarray, form: str, row: int =
     wrong = (moments.isna() & text.notna() & (text != "")).to_numpy()
     if wrong.any():
         at = int(np.argmax(wrong))
-        raise InputError(
-            f"row {row + at}: found '{str(text.iloc[at])[:40]}', expected a date and time"
-            + (f" like {form}" if form else " like 2026-10-03T10:12:00.125"),
-            remedy="" if form else 'give its form: format = "%d.%m.%Y %H:%M:%S.%f" under [time]',
-        )
+        known = {"row": row + at, "cell": str(text.iloc[at])[:40]}
+        raise refusal("other_form", **known, form=form) if form else refusal("no_moment", **known)
     return np.asarray(moments.dt.tz_localize(None), dtype="datetime64[ns]").astype(np.int64)
 
 

@@ -17,6 +17,7 @@ from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import ArrayReader, Opened, Stored, called_signals, stored
 from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
 from bampipe.data.readers.trial import Wanted, opened
+from bampipe.data.refusals import refusal
 from bampipe.data.units import units_beside
 from bampipe.errors import InputError
 
@@ -123,12 +124,8 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         yield _stating(held, units), notes
         return
     if not isinstance(content, list) and len(lists) != 1:
-        raise InputError(
-            f"{len(lists)} lists of samples: {', '.join(lists)}"
-            if lists
-            else "no list of samples, that is of objects with named values, and no array",
-            remedy="leave one list in the file, or export the log as CSV",
-        )
+        name = "several_lists" if lists else "no_list"
+        raise refusal(name, count=len(lists), lists=", ".join(lists))
     samples = content if isinstance(content, list) else next(iter(lists.values()))
     if not samples:
         raise InputError("a header but no samples")
@@ -182,6 +179,4 @@ def _parsed(text: str, where: str = "") -> object:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         line = f" at line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
-        raise InputError(
-            f"not sound JSON{line}", where=where, remedy="was the log cut off? copy it again"
-        ) from error
+        raise refusal("no_json", where, line=line) from error

@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from pyarrow import dataset
 from bampipe.data.readers import lerobot, moments
 from bampipe.data.readers.arrays import LARGEST_WIDTH, ArrayReader, Opened, Stored, stored
 from bampipe.data.readers.nested import leaves
-from bampipe.data.readers.trial import NUMBER, RawTrial, Wanted
+from bampipe.data.readers.trial import NUMBER, Wanted
 from bampipe.data.units import SCALES, in_steps, units_beside
 from bampipe.errors import InputError
 
@@ -38,6 +37,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     is_parquet = path.suffix.lower() == ".parquet"
     file = dataset.dataset(path, format=of_parquet if is_parquet else "feather")
     schema, rows = file.schema, file.count_rows()
+    counting = lerobot.NO_READINGS if wanted is None and lerobot.EPISODE in schema.names else ()
     while any(pa.types.is_struct(field.type) for field in schema):
         schema = schema.empty_table().flatten().schema
     attributes = json.loads((file.schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}"))
@@ -48,7 +48,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
         return file.to_table(columns=[name], use_threads=False).column(0)
 
     found = {}
-    for field in schema:
+    for field in (each for each in schema if each.name not in counting):
         kind = field.type.value_type if pa.types.is_dictionary(field.type) else field.type
         kind = next((k for k, checks in _KINDS.items() if any(x(kind) for x in checks)), "V")
         own = field.metadata or {}
@@ -74,20 +74,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     yield found, ()
 
 
-READER = ArrayReader("column", _opened)
-
-
-def read(path: Path, wanted: Wanted) -> RawTrial:
-    """The wanted columns; `InputError` as `read_arrays`, or where the file is damaged."""
-    trial = READER.read(path, wanted)
-    return replace(trial, begun=trial.begun or lerobot.episodes_begin(path))
-
-
-def columns(path: Path) -> dict[str, str]:
-    """Names and units of the columns that hold readings; the unit of moments is "datetime"."""
-    found = READER.columns(path)
-    numbers = lerobot.NO_READINGS if lerobot.EPISODE in found else ()
-    return {name: unit for name, unit in found.items() if name not in numbers}
+READER = ArrayReader("column", _opened, lerobot.episodes_begin)
 
 
 def _cells(

@@ -53,11 +53,10 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
     units = {column: layout.units[column] for column in wanted.columns if column in layout.units}
     return RawTrial(
         samples.values(),
-        layout.first_line,
+        np.concatenate(samples.lines),
         (*notes, *samples.notes),
         (*said, *layout.remarks),
         units,
-        tuple(samples.resumed),
         tuple(samples.begun),
         samples.since,
     )
@@ -210,14 +209,15 @@ def _head(stream: BinaryIO) -> bytes:
 
 @dataclass
 class _Samples:
-    """Samples read so far: the wanted columns in parts, number of rows; see `RawTrial`."""
+    """Samples read so far: the wanted columns and their lines in parts; see `RawTrial`."""
 
     wanted: Wanted
     nothing: list[str] = field(default_factory=list)
     parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    lines: list[np.ndarray] = field(default_factory=list)
     rows: int = 0
     notes: list[str] = field(default_factory=list)
-    resumed: list[tuple[int, int]] = field(default_factory=list)
+    resumed: bool = False
     begun: list[int] = field(default_factory=list)
     since: dict[str, int] = field(default_factory=dict)
 
@@ -231,6 +231,7 @@ class _Samples:
             else:
                 part = np.array(cells.to_numpy(zero_copy_only=False), dtype=np.float64)
             self.parts.setdefault(column, []).append(part)
+        self.lines.append(np.arange(first_line, first_line + batch.num_rows))
         self.rows += batch.num_rows
         check_size(self.rows, self.wanted)
 
@@ -249,7 +250,7 @@ class _Samples:
     def cut(self, rows: int, parts: int) -> None:
         """Forget all but the first ``rows``, which the first ``parts`` hold."""
         self.rows = rows
-        for held in self.parts.values():
+        for held in (self.lines, *self.parts.values()):
             del held[parts:]
 
     def values(self) -> dict[str, np.ndarray]:
@@ -268,7 +269,7 @@ def _read_samples(stream: BinaryIO, layout: TableLayout, end: int, samples: _Sam
     InputError where a row is damaged, or too many lines are text.
     """
     while True:
-        rows, parts = samples.rows, max(map(len, samples.parts.values()), default=0)
+        rows, parts = samples.rows, len(samples.lines)
         try:
             _read_stretch(stream, layout, end, samples)
             return
@@ -295,7 +296,7 @@ def _read_samples(stream: BinaryIO, layout: TableLayout, end: int, samples: _Sam
                 ends = layout.ends_in_words(line.text)
                 what = "ends in words" if ends else "is text and no sample"
                 samples.notes.append(f"row {line.number} {what}: left out")
-            samples.resumed.append((samples.rows, line.number + 1))
+            samples.resumed = True
             layout = replace(layout, start=line.end, first_line=line.number + 1)
 
 
@@ -403,19 +404,13 @@ def _fault(message: str, layout: TableLayout, line: Line) -> InputError:
     """The plain form of Arrow's message on a line of a text file."""
     where, cell = f"row {line.number}", _CELL.search(message)
     if torn := _TORN.search(message):
-        expected, actual, text = int(torn[2]), int(torn[3]), torn[4]
-        commas = actual > expected and re.fullmatch(r'[\s"0-9,+-]*', text)
+        known, text = {"expected": int(torn[2]), "actual": int(torn[3])}, torn[4]
         clock = re.search(r"\d+:\d\d:\d\d,\d+", text) if layout.delimiter == "," else None
-        remedy = "the line is damaged: take it out of the file"
-        if commas:
-            remedy = "decimal commas? put semicolons between columns, or points as decimal sign"
-        elif clock and actual > expected:
-            remedy = (
-                f"the comma in '{clock[0]}' separates columns, too: export with semicolons between"
-                " columns, or a point before the fraction of a second"
-            )
-        what = f"{actual} cells, where the header has {expected}"
-        return InputError(what, where=where, remedy=remedy)
+        if known["actual"] > known["expected"] and re.fullmatch(r'[\s"0-9,+-]*', text):
+            return refusal("torn_at_decimals", where, **known)
+        if known["actual"] > known["expected"] and clock:
+            return refusal("torn_at_seconds", where, **known, clock=clock[0])
+        return refusal("torn", where, **known)
     assert cell is not None
     column, value = layout.header[int(cell[1])], cell[3]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
@@ -423,8 +418,6 @@ def _fault(message: str, layout: TableLayout, line: Line) -> InputError:
     remedy = str(next(fitting, {"remedy": ""})["remedy"])
     if moments.is_moment(value):
         remedy = 'is it the time? then say unit = "datetime" under [time]'
-    return InputError(
-        f"found '{shown}', expected a number",
-        where=f"{where}, column '{column}'",
-        remedy=remedy.format(cell=value.strip(), decimal=layout.decimal),
-    )
+    remedy = remedy.format(cell=value.strip(), decimal=layout.decimal)
+    where = f"{where}, column '{column}'"
+    return InputError(f"found '{shown}', expected a number", where=where, remedy=remedy)

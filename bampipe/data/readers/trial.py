@@ -11,6 +11,7 @@ from typing import BinaryIO, Literal, cast
 import numpy as np
 from pydantic import Field
 
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError, did_you_mean
 from bampipe.schema import Declaration, Distinct, Text
 
@@ -57,59 +58,40 @@ class RawTrial:
 
     Attributes:
         columns: (T,) float64 a column, NaN where a cell is empty.
-        first_row: number that the first sample has in the file, for messages.
+        rows: (T,) int64, the row or number of each sample in the file, for messages.
         notes: what was left out, one sentence each.
         remarks: what was found out about the file, one sentence each.
         units: units that the file itself gives to its columns.
-        resumed: after lines that hold no sample, the sample that follows and its row.
         begun: samples at which another recording begins: the header stands again, or an episode.
         since: of columns of dates and times, where known, their first moment, ns since 1970.
-        kept: (T,) rows of the samples, where some between them were left out.
     """
 
     columns: dict[str, np.ndarray]
-    first_row: int
+    rows: np.ndarray
     notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
-    resumed: tuple[tuple[int, int], ...] = ()
     begun: tuple[int, ...] = ()
     since: Mapping[str, int] = field(default_factory=dict)
-    kept: np.ndarray | None = None
 
     def __len__(self) -> int:
-        return len(next(iter(self.columns.values()), ()))
-
-    @property
-    def rows(self) -> np.ndarray:
-        """Row in the file of every sample, (T,) int64."""
-        if self.kept is not None:
-            return self.kept
-        rows = np.arange(self.first_row, self.first_row + len(self), dtype=np.int64)
-        for sample, row in self.resumed:
-            rows[sample:] += row - rows[sample] if sample < len(rows) else 0
-        return rows
+        return len(self.rows)
 
     def between(self, start: int, stop: int) -> "RawTrial":
         """The samples from ``start`` to before ``stop``."""
         return replace(
             self,
             columns={name: values[start:stop] for name, values in self.columns.items()},
-            first_row=int(self.rows[start]),
-            resumed=tuple((at - start, row) for at, row in self.resumed if start < at < stop),
+            rows=self.rows[start:stop],
             begun=tuple(at - start for at in self.begun if start < at < stop),
-            kept=None if self.kept is None else self.kept[start:stop],
         )
 
 
 def check_size(rows: int, wanted: Wanted) -> None:
     """Raise InputError where ``rows`` samples of the wanted columns take too much memory."""
     if rows * len(wanted.columns) * 8 > wanted.largest_bytes:
-        raise InputError(
-            f"{rows} rows of {len(wanted.columns)} columns are more than the"
-            f" {wanted.largest_bytes >> 20} MB allowed",
-            remedy="split the trial, or allow more (largest_trial_mb)",
-        )
+        most = wanted.largest_bytes >> 20
+        raise refusal("too_large", rows=rows, columns=len(wanted.columns), most=most)
 
 
 def check_columns(found: Sequence[str], wanted: Sequence[str], where: str = "") -> None:
@@ -117,19 +99,12 @@ def check_columns(found: Sequence[str], wanted: Sequence[str], where: str = "") 
     for column in wanted:
         if column not in found:
             shown = ", ".join(found[:12]) + (", ..." if len(found) > 12 else "")
-            others = [other for other in found if other not in wanted]
-            raise InputError(
-                f"no column '{column}'{did_you_mean(column, others)}",
-                where=where,
-                remedy=f"it has {shown}" if shown else "",
-            )
+            near = did_you_mean(column, [other for other in found if other not in wanted])
+            remedy = f"it has {shown}" if shown else ""
+            raise InputError(f"no column '{column}'{near}", where=where, remedy=remedy)
         if list(found).count(column) > 1:
             first, second = [n for n, other in enumerate(found, 1) if other == column][:2]
-            raise InputError(
-                f"column '{column}' stands twice, as columns {first} and {second}",
-                where=where,
-                remedy="keep the right one",
-            )
+            raise refusal("stands_twice", where, column=column, first=first, second=second)
 
 
 def aligned(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:

@@ -449,13 +449,6 @@ class Channel(NamedDeclaration):
         if self.stated_scale == 0.0:
             yield InputError("found 0, expected another number", where="scale")
         if self.signed != (self.wrap_bits is not None):
-            yield InputError(
-                "signed and wrap_bits belong together",
-                remedy="give wrap_bits = 16, signed = true for a signed register read as unsigned",
-            )
+            yield refusal("signed_alone")
         if self.sign_bit is not None and self.wrap_bits is not None:
-            yield InputError(
-                "given beside wrap_bits, and a register holds its sign in one way only",
-                where="sign_bit",
-                remedy="sign_bit: sign and magnitude; wrap_bits: two's complement",
-            )
+            yield refusal("two_signs")

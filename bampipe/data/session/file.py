@@ -261,10 +261,7 @@ class Session(Declaration):
             for other, share in encoder.also_reads.items():
                 row[axes.index(other)] = share
         if not np.linalg.cond(reads) < LARGEST_CONDITION:
-            raise InputError(
-                "the readings do not give the positions: some motion shows in none of them",
-                where="session.toml: encoders.*.also_reads",
-            )
+            raise refusal("hidden_motion")
         return np.linalg.inv(reads)
 
     @property

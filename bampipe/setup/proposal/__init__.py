@@ -15,8 +15,8 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.names import DRIVERS, words
 from bampipe.data.readers import lerobot
+from bampipe.data.refusals import refusal
 from bampipe.data.survey import Survey, SurveyedColumn, survey
-from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.lists import join_names
 from bampipe.physics.device import Device
@@ -75,11 +75,7 @@ def propose(
         InputError: no logs, a session file is there already, or no such device.
     """
     if (folder / SESSION).exists():
-        raise InputError(
-            f"there is a {SESSION} already",
-            where=str(folder),
-            remedy=f"it is left alone; to run it: bampipe run {folder}",
-        )
+        raise refusal("there_already", str(folder), name=SESSION, folder=folder)
     found = survey(folder, names, episodes)
     if not device and not found.of(*DRIVERS):
         _refuse_goals(folder, found)
@@ -138,8 +134,8 @@ def _refuse_goals(folder: Path, found: Survey) -> None:
         return
     times = found.of("time")
     loops = lerobot.describe_loops(times[0].values, columns) if times else ""
-    what = sentence("goals_alone", known=sentence("loops", loops=loops) if loops else "")
-    raise InputError(what, where=str(folder), remedy=sentence("record_drive"))
+    known = sentence("loops", loops=loops) if loops else ""
+    raise refusal("goals_alone", str(folder), known=known)
 
 
 def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> ChosenDevice:
@@ -283,9 +279,7 @@ def write_proposal(folder: Path, proposal: ProposedSession) -> list[Path]:
         texts[folder / DEVICE] = proposal.device
     for path in texts:
         if path.exists():
-            raise InputError(
-                "is there already and is left alone", where=str(path), remedy="move it away"
-            )
+            raise refusal("left_alone", str(path))
     for path, text in texts.items():
         write_text(path, text)
     return list(texts)

@@ -12,6 +12,7 @@ from bampipe.data.chain import Branches
 from bampipe.data.device_file import complete_device, read_device_file
 from bampipe.data.names import REFERENCE_WORDS, words
 from bampipe.data.readers import is_text
+from bampipe.data.refusals import refusal
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit
 from bampipe.data.urdf import unexpanded
@@ -100,11 +101,8 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
             raise unexpanded(macros)
         return None
     if len(urdfs) > 1:
-        raise InputError(
-            f"{len(urdfs)} files of robots: {', '.join(path.name for path in urdfs)}",
-            where=str(folder),
-            remedy="leave the one of the logs",
-        )
+        names = ", ".join(path.name for path in urdfs)
+        raise refusal("several_robots", str(folder), count=len(urdfs), names=names)
     text = f'schema = "{_SCHEMA}"\nname = "{urdfs[0].stem}"\n\n[robot]\nurdf = "{urdfs[0].name}"\n'
     try:
         device = _complete(folder, text)
@@ -164,9 +162,7 @@ def _device_file(folder: Path, wanted: str) -> ChosenDevice:
     device = registry.device_from(read_device_file(path), str(path))
     full, root = path.resolve(), folder.resolve()
     if not full.is_relative_to(root):
-        raise InputError(
-            "the device file is not beside the logs", where=wanted, remedy=f"copy it to {folder}"
-        )
+        raise refusal("device_elsewhere", wanted, folder=folder)
     return ChosenDevice(full.relative_to(root).as_posix(), device)
 
 
@@ -194,8 +190,8 @@ def new_device(folder: Path, match: Matcher) -> ChosenDevice:
     position = match.position("")
     if position is None:
         file, columns = found.trials[0].file, ", ".join(c.name for c in found.columns[:12])
-        way = sentence("say_names" if is_text(file) else "name_columns", columns=columns)
-        raise InputError("no column looks like a position", where=f"{folder}: {file}", remedy=way)
+        name = "no_position" if is_text(file) else "no_position_named"
+        raise refusal(name, f"{folder}: {file}", columns=columns)
     linear = positions.slides(position, found)
     driver, role = match.driver(position)
     stage = match.stage(position, driver) if driver is not None and linear else {}

@@ -4,11 +4,12 @@ import re
 from dataclasses import replace
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from bampipe.data import guesses
 from bampipe.data.names import DRIVERS, words
 from bampipe.data.quality.clock import find_fresh_rows
-from bampipe.data.quality.encoders import integral, unwrapped
+from bampipe.data.quality.encoders import unwrapped
 from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_spikes
 from bampipe.data.session import Register
 from bampipe.data.survey import Survey, SurveyedColumn
@@ -66,7 +67,7 @@ def slides(column: SurveyedColumn, found: Survey) -> bool:
 def travelled(column: SurveyedColumn, t: np.ndarray) -> np.ndarray:
     """Position (T,) as the column has it; the integral over ``t`` (T,), s, of a velocity."""
     values: np.ndarray = np.nan_to_num(column.values)
-    return integral(t, values) if is_velocity(column) else values
+    return cumulative_trapezoid(values, t, initial=0.0) if is_velocity(column) else values
 
 
 def position_in_si(column: SurveyedColumn, t: np.ndarray, si: str) -> np.ndarray:

@@ -9,11 +9,11 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.names import words
 from bampipe.data.quality.clock import spread_stamps, unroll
+from bampipe.data.refusals import refusal
 from bampipe.data.session import SECONDS, Register
 from bampipe.data.stated_rate import interval_of
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import bare, spelled, unit
-from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.results.rounding import rounded
@@ -181,11 +181,7 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
     if stamps is not None:
         steps = np.diff(stamps.values[np.isfinite(stamps.values)])
         if np.all(steps) and _MIXED < np.mean(steps < 0.0):
-            raise InputError(
-                f"{stamps.name} falls from row to row: it is written backwards, or out of order",
-                where=found.trials[0].file,
-                remedy="sort its rows by their time",
-            )
+            raise refusal("out_of_order", found.trials[0].file, column=stamps.name)
         why = f"{stamps.name} falls at {np.sum(steps < 0)} and stands at {np.sum(steps == 0)} steps"
         why = why if steps.min() <= 0 else f"{stamps.name} numbers the rows"
     if rates:
