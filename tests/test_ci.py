@@ -160,7 +160,7 @@ def test_every_command_takes_the_best_confirmed_model(
         "diagnose:base",
         f"diagnose:{better}",
     ]
-    row = read_run(root).tables["sessions"][0]
+    row = read_run(root)["sessions"][0]
     assert row["counting_model"] == better
     monkeypatch.setattr("bampipe.declarations.export.export_model", lambda run, name, form: name)
     code, out, err = command("export", "s1")

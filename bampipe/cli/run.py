@@ -120,16 +120,20 @@ def run(
     _report_runs(outcomes, several, json)
     refresh(runs, several, quiet or json)
     if not several:
-        from bampipe.cli.next_step import after_run, print_forecasts
-
-        root, counting = outcomes[0].root, outcomes[0].model
-        if not json:
-            print_forecasts(root, counting)
-        advice = after_run(root, counting).replace("RUN", places.next_to(root, runs))
-        show.print_advice(advice, quiet, json)
+        _advise(outcomes[0], runs, quiet, json)
     code = max(outcome.exit_code for outcome in outcomes)
     if code:
         raise typer.Exit(code)
+
+
+def _advise(outcome: "Outcome", runs: Path, quiet: bool, json: bool) -> None:
+    """Print what came of earlier proposals, and the next command."""
+    from bampipe.cli.next_step import after_run, print_forecasts
+
+    if not json:
+        print_forecasts(outcome.root, outcome.model)
+    command = after_run(outcome.root, outcome.model)
+    show.print_advice(command.replace("RUN", places.next_to(outcome.root, runs)), quiet, json)
 
 
 def _make_requests(

@@ -79,23 +79,27 @@ def _headline(codes: Sequence[int]) -> str:
 
 
 def _session(outcome: Outcome) -> tuple[str, ...]:
-    """Return the row of a session, with its held-out errors over their noise floors."""
     if outcome.error:
         return outcome.root.name, STATES[outcome.exit_code], "", "", outcome.error
     states = [verdict.state for verdict in outcome.verdicts]
     counts = [f"{states.count(one)} {one}" for one in ("failed", "warned") if one in states]
     gates = f"gates: {', '.join(counts)}" if counts else ""
-    run, model = RunFolder(outcome.root), outcome.model
+    errors = _errors(RunFolder(outcome.root), outcome.model)
+    return outcome.root.name, STATES[outcome.exit_code], outcome.model, errors, gates
+
+
+def _errors(run: RunFolder, model: str) -> str:
+    """Return the ratio of held-out error to noise floor of each axis."""
     try:
         found = run.find(ValidateResult, model) if model else None
     except InputError:
-        return outcome.root.name, STATES[outcome.exit_code], model, "not readable", gates
-    errors = ", ".join(
+        return "not readable"
+    axes = found.axes if found else {}
+    return ", ".join(
         f"{axis} {error.held_out_rmse / error.noise_floor:.2f}"
-        for axis, error in (found.axes.items() if found else ())
+        for axis, error in axes.items()
         if error.noise_floor
     )
-    return outcome.root.name, STATES[outcome.exit_code], model, errors, gates
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

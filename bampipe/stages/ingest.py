@@ -79,51 +79,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     rate, measured = session.sample_rate / every, float(trials["sample_rate_hz"].median())
     if abs(measured - rate) > RATE_TOLERANCE * rate:
         rate = measured
-    force = session.force
-    encoders, forces = channels.encoders(), channels.forces()
-    counted = channels.count_warnings()
-    own = session.device_file is not None
-    description = IngestResult.of(
-        session,
-        device=device.name,
-        device_file=session.device if own else None,
-        placeholders=tuple(placeholders(device.declaration)) if own else (),
-        driven=bool(device.drive),
-        default_effects=device.default_effects,
-        sample_rate_hz=rate,
-        announced_rate_hz=session.sample_rate,
-        kept_every=every,
-        axes={
-            encoder.name: EncoderChannel.of(
-                encoders[encoder.name],
-                encoder,
-                resolution_stated=encoders[encoder.name].stated,
-                resolution_measured=encoders[encoder.name].measured,
-                raw_unit=encoder.stated_unit,
-                unit_in_log=any(encoder.column in row["stated"] for row in rows),
-            )
-            for encoder in session.encoders
-        },
-        force=ForceChannels.of(
-            force,
-            columns=force.names if force else (),
-            unit=device.force_unit,
-            noise_sd={name: found.noise_sd for name, found in forces.items()},
-            noise_sd_stated=force.noise_sd if force else None,
-            noise_sd_measured={name: found.measured for name, found in forces.items()},
-            look_like_counts=tuple(counted),
-        ),
-        sensor_warnings=(
-            *(each.warning for each in (*encoders.values(), *forces.values()) if each.warning),
-            *counted.values(),
-        ),
-        mains_hum=channels.mains_hum(),
-        brakes={
-            f"brake_{brake.axis}": RecordedChannel(unit=brake.unit) for brake in session.brakes
-        },
-        channels={channel.name: RecordedChannel.of(channel) for channel in session.channels},
-        dead={row["trial_id"]: row["dead"] for row in rows if row["dead"]},
-    )
+    description = _description(session, device, rate, every, channels, rows)
     description.write(out)
     if session.device_file is not None:
         _write_device(session.device_file, device, out / "ingest")
@@ -239,6 +195,62 @@ def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, 
             if name.startswith("q_")
         },
     }
+
+
+def _description(
+    session: Session,
+    device: Device,
+    rate: float,
+    every: int,
+    channels: ChannelRecords,
+    rows: list[dict[str, Any]],
+) -> IngestResult:
+    """Return the content of session.json, with sensors as used."""
+    force = session.force
+    encoders, forces = channels.encoders(), channels.forces()
+    counted = channels.count_warnings()
+    own = session.device_file is not None
+    return IngestResult.of(
+        session,
+        device=device.name,
+        device_file=session.device if own else None,
+        placeholders=tuple(placeholders(device.declaration)) if own else (),
+        driven=bool(device.drive),
+        default_effects=device.default_effects,
+        sample_rate_hz=rate,
+        announced_rate_hz=session.sample_rate,
+        kept_every=every,
+        axes={
+            encoder.name: EncoderChannel.of(
+                encoders[encoder.name],
+                encoder,
+                resolution_stated=encoders[encoder.name].stated,
+                resolution_measured=encoders[encoder.name].measured,
+                raw_unit=encoder.stated_unit,
+                unit_in_log=any(encoder.column in row["stated"] for row in rows),
+            )
+            for encoder in session.encoders
+        },
+        force=ForceChannels.of(
+            force,
+            columns=force.names if force else (),
+            unit=device.force_unit,
+            noise_sd={name: found.noise_sd for name, found in forces.items()},
+            noise_sd_stated=force.noise_sd if force else None,
+            noise_sd_measured={name: found.measured for name, found in forces.items()},
+            look_like_counts=tuple(counted),
+        ),
+        sensor_warnings=(
+            *(each.warning for each in (*encoders.values(), *forces.values()) if each.warning),
+            *counted.values(),
+        ),
+        mains_hum=channels.mains_hum(),
+        brakes={
+            f"brake_{brake.axis}": RecordedChannel(unit=brake.unit) for brake in session.brakes
+        },
+        channels={channel.name: RecordedChannel.of(channel) for channel in session.channels},
+        dead={row["trial_id"]: row["dead"] for row in rows if row["dead"]},
+    )
 
 
 def _summary(session: Session, rows: list[dict[str, Any]]) -> dict[str, object]:

@@ -109,15 +109,10 @@ class Config(Criteria):
 
 @dataclass(frozen=True)
 class _Case:
-    """An identified model with its parameters, its trials and diagnosis, and the request.
-
-    ``asked`` is the purpose that was asked for, or the parameter's, if ``parameter`` is one.
-    """
+    """An identified model with its parameters, its trials and diagnosis, and the request."""
 
     run: RunFolder
     config: Config
-    asked: Purpose | Literal["auto"]
-    parameter: str
     spec: ModelSpec
     system: System
     p: Array
@@ -136,12 +131,12 @@ class _Case:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Propose a trial for one identified model."""
-    case = _read_case(run, config, progress)
-    forecast = _make_forecast(case, progress)
+    case, purpose, parameter = _read_case(run, config, progress)
+    forecast = _make_forecast(case, purpose, progress)
     space = _lay_out_designs(case, forecast)
-    ranked = _rank(forecast, space, case.parameter, progress)
+    ranked = _rank(forecast, space, parameter, progress)
     progress(0.9, "forecasting their gain")
-    result = _record(case, forecast, ranked)
+    result = _record(case, forecast, parameter, ranked)
     if config.trajectory:
         result = _write_trajectory(out, case, forecast.rehearsal, ranked[0], result)
     if config.plan:
@@ -166,7 +161,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return _summary(result)
 
 
-def _read_case(run: RunFolder, config: Config, progress: Progress) -> _Case:
+def _read_case(
+    run: RunFolder, config: Config, progress: Progress
+) -> tuple[_Case, Purpose | Literal["auto"], str]:
     """Return the model with its results, and the requested purpose and parameter."""
     model = load_model(run, config.model)
     if config.trajectory:
@@ -179,9 +176,9 @@ def _read_case(run: RunFolder, config: Config, progress: Progress) -> _Case:
             where=f"device {model.device.name!r}",
         )
     p, found = read_estimate(run, config.model, system), run.read(IdentifyResult, config.model)
-    asked, parameter = _split(config.purpose, list(found.parameters))
+    purpose, parameter = _split(config.purpose, list(found.parameters))
     diagnosed = run.find(DiagnoseResult, config.model)
-    if diagnosed is None and asked == "decision":
+    if diagnosed is None and purpose == "decision":
         raise InputError(
             "there is no diagnosis yet, so nothing to decide is known",
             where=str(run.root),
@@ -195,14 +192,13 @@ def _read_case(run: RunFolder, config: Config, progress: Progress) -> _Case:
         raise InputError("no axis moves in the present trials", where=str(run.root))
     limits = read_limits(model.device, seen) if config.trajectory else {}
     spec = read_spec(run, config.model, model)
-    return _Case(
-        run, config, asked, parameter, spec, system, p, found, diagnosed, session, seen, limits
-    )
+    case = _Case(run, config, spec, system, p, found, diagnosed, session, seen, limits)
+    return case, purpose, parameter
 
 
-def _make_forecast(case: _Case, progress: Progress) -> Forecast:
+def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Progress) -> Forecast:
     """Prepare a forecast for the purpose asked for, or else for what the diagnosis left open."""
-    asked, trials, comparison, detectability = case.asked, case.session.trials, None, None
+    trials, comparison, detectability = case.session.trials, None, None
     if asked in ("auto", "decision") and case.diagnosed is not None:
         comparison = _compare_alternatives(case, case.diagnosed)
     if asked == "decision" and comparison is None:
@@ -278,7 +274,9 @@ def _rank(
     return rank_designs(space, utility, partial(report, 0.5))
 
 
-def _record(case: _Case, forecast: Forecast, ranked: Sequence[RankedDesign]) -> NextResult:
+def _record(
+    case: _Case, forecast: Forecast, parameter: str, ranked: Sequence[RankedDesign]
+) -> NextResult:
     """Return the proposal, its reason and its expected gain."""
     proposals = tuple(forecast.proposal(one) for one in ranked)
     table: dict[str, Detectable] = {}
@@ -294,7 +292,7 @@ def _record(case: _Case, forecast: Forecast, ranked: Sequence[RankedDesign]) -> 
     result = NextResult(
         model=case.config.model,
         purpose=forecast.purpose,
-        parameter=case.parameter,
+        parameter=parameter,
         trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in motions)),
         sentence=proposals[0].sentence,
         why="",

@@ -16,7 +16,7 @@ from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
-from bampipe.estimate.gear_windup import find_windup
+from bampipe.estimate.gear_windup import Windup, find_windup
 from bampipe.estimate.hysteresis import Hysteresis, measure_hysteresis
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
@@ -169,24 +169,30 @@ def _gears(
         except InputError as error:
             notes.append(f"{axis}: {error}")
             continue
-        number = system.coordinates.index(axis)
-        unit = system.coordinate_units[number]
-        size, stiffness, sd = abs(windup.compliance), None, None
-        if size > _SURE * windup.compliance_sd:
-            stiffness, sd = 1.0 / size, windup.compliance_sd / size**2
-        else:
-            notes.append(f"{axis}: its two encoders do not move apart with the load.")
-        found[axis] = GearStiffness.of(
-            windup,
-            stiffness=stiffness,
-            sd=sd,
-            unit=f"{system.torque_units[number]}/{unit}",
-            play=None if windup.play is None else windup.play * np.sign(windup.compliance),
-            play_unit=unit,
-            side="motor" if windup.compliance > 0.0 else "load",
-            channel=second[axis],
-        )
+        found[axis] = _gear(axis, second[axis], windup, system, notes)
     return found
+
+
+def _gear(
+    axis: str, channel: str, windup: Windup, system: System, notes: list[str]
+) -> GearStiffness:
+    number = system.coordinates.index(axis)
+    unit = system.coordinate_units[number]
+    size, stiffness, sd = abs(windup.compliance), None, None
+    if size > _SURE * windup.compliance_sd:
+        stiffness, sd = 1.0 / size, windup.compliance_sd / size**2
+    else:
+        notes.append(f"{axis}: its two encoders do not move apart with the load.")
+    return GearStiffness.of(
+        windup,
+        stiffness=stiffness,
+        sd=sd,
+        unit=f"{system.torque_units[number]}/{unit}",
+        play=None if windup.play is None else windup.play * np.sign(windup.compliance),
+        play_unit=unit,
+        side="motor" if windup.compliance > 0.0 else "load",
+        channel=channel,
+    )
 
 
 def _loops_of(
@@ -225,13 +231,25 @@ def _loops_of(
     pose = np.median(q, axis=0)
     channels = {name: held[name] for name in system.inputs}
     motion = Motion(trial_id, grid.t, q, still, still, still, channels)
-    signals, calibration = Signals.of_session(system, session), {}
+    signals = Signals.of_session(system, session)
+    calibration = _find_calibration_shares(system, signals, motion, number, torque)
+    return _Loops(trial_id, pose, torque, deflection, rate, found, calibration)
+
+
+def _find_calibration_shares(
+    system: System, signals: Signals, motion: Motion, number: int, torque: Array
+) -> dict[str, float]:
+    """Return the share of a stiffness that one standard uncertainty of each source is.
+
+    ``torque`` (T,) is that on axis ``number``, as logged.
+    """
+    deflection, shares = motion.q[:, number], {}
     for name, change in calibration_changes(signals):
         moved = change.of_motion(motion, signals)
         theirs = _applied(system, moved.q, moved.inputs(system.inputs), moved.t)[:, number]
         torques = linregress(torque, theirs).slope
-        calibration[name] = torques / linregress(deflection, moved.q[:, number]).slope - 1.0
-    return _Loops(trial_id, pose, torque, deflection, rate, found, calibration)
+        shares[name] = torques / linregress(deflection, moved.q[:, number]).slope - 1.0
+    return shares
 
 
 def _applied(system: System, q: Array, u: Array, t: Array) -> Array:

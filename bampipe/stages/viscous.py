@@ -14,7 +14,7 @@ from scipy import stats
 
 from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.data.store import read_parquet, trial_ids, write_parquet
+from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.identification import filter_run
@@ -63,7 +63,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     trials = trials[(trials["kind"] == "viscous") & (trials["status"] != "set_aside")]
     path = run.require("filter/kinematics.parquet", "filter")
-    trials = trials[trials["trial_id"].astype(str).isin(trial_ids(path))]
+    moving = set(read_parquet(path, columns=["trial_id"])["trial_id"].astype(str))
+    trials = trials[trials["trial_id"].astype(str).isin(moving)]
     target = f"models/{config.model}/viscous"
     if trials.empty:
         rows = pd.DataFrame(columns=["t_total", "trial_id"])
@@ -86,6 +87,22 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     for name in trials["trial_id"].astype(str):  # as if no brake had been commanded
         motion = read_motion(path, name, system, stretches.get(name, ()), filters)
         motions.append(motion.with_channels({b: np.zeros(motion.t.size) for b in brakes}))
+    commanded = trials["viscous_n_s_per_m"].to_numpy(dtype=float)
+    result, frame = _estimated(run, system, motions, commanded, identified, config, progress)
+    write_parquet(out / f"{target}.parquet", frame)
+    return result.write(out)
+
+
+def _estimated(
+    run: RunFolder,
+    system: System,
+    motions: Sequence[Motion],
+    commanded: Array,
+    identified: IdentifyResult,
+    config: Config,
+    progress: Progress,
+) -> tuple[ViscousResult, pd.DataFrame]:
+    """Return the content of viscous.json, and the convergence of the estimates."""
     known = identified.parameters
     estimates = {name: one.estimate for name, one in known.items()}
     start = np.array([estimates.get(item.name, item.prior) for item in system.parameters])
@@ -94,19 +111,19 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if identified.noise is not None and config.force_noise == 0.0:
         found_sd = [identified.noise.process_sd[name] for name in system.noise]
         settings = settings._replace(noise_sd=np.array(found_sd))
-    is_brake = [name in brakes for name in system.inputs]
+    brakes = [name in system.model.device.brakes.values() for name in system.inputs]
     readings = []
     for motion in motions:
         trial = filter_run.load_filter_trial(run, motion, system, start, settings)
-        readings.append(replace(trial, u=np.where(is_brake, 0.0, trial.u)))
+        readings.append(replace(trial, u=np.where(brakes, 0.0, trial.u)))
     free = [item for item in system.parameters if not item.fixed]
     late_s = identified.input_timing.estimate
     model = filter_run.build_filter_model(system, readings, start, False, late_s)
-    commanded = trials["viscous_n_s_per_m"].to_numpy(dtype=float)
     command = float(np.nanmean(commanded)) if np.isfinite(commanded).any() else None
     value = np.array([estimates.get(item.name, command or 0.0) for item in free])
     sd = np.array([known[item.name].sd if item.name in known else item.sd for item in free])
     sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
+
     attempts: list[filter_run.Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
     found = filter_run.follow_trials(
         model,
@@ -132,8 +149,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     frame = tabulate_trace(names, model, motions, found, config.trace_rows)
     kept = [c for c in frame if c in ("t_total", "trial_id") or str(c).startswith(f"{FIELD}.")]
     frame = frame[kept].rename(columns=lambda c: str(c).removeprefix(f"{FIELD}."))
-    write_parquet(out / f"{target}.parquet", frame)
-    return ViscousResult(
+    result = ViscousResult(
         model=config.model,
         trials=tuple(motion.trial_id for motion in motions),
         directions=directions,
@@ -143,7 +159,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             + ("" if command is None else f" ({entry.verdict})")
             for name, entry in directions.items()
         ),
-    ).write(out)
+    )
+    return result, frame
 
 
 def _block_sd(
