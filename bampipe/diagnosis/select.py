@@ -23,7 +23,6 @@ from bampipe.diagnosis.session import (
     bounds_of,
     candidates_of,
     change_effects,
-    rms,
     system_of,
     worker_state,
     workers,
@@ -31,6 +30,7 @@ from bampipe.diagnosis.session import (
 from bampipe.diagnosis.set_cost import added_effects, effect_names, removed_effects
 from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.compare import NOTICEABLE
+from bampipe.trials.likelihood import Likelihood
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.samples import take_samples
 
@@ -288,19 +288,19 @@ def _leave_out(
 
 def _find_misleading(fit: Fit, probabilities: Probabilities, own: Sequence[str]) -> set[str]:
     """Return the effects that are less probable than not and raise the held-out error."""
-    rows = fit.held_out_rows
-    out, least = set[str](), _log_squares(fit, rows()).sum()
+    rows, like = fit.held_out_rows, fit.likelihood
+    out, least = set[str](), _log_squares(like, rows()).sum()
     while doubtful := [e for e in own if e not in out and probabilities.effects.get(e, 0.0) < 0.5]:
-        left, worst = min((_log_squares(fit, rows({*out, e})).sum(), e) for e in doubtful)
+        left, worst = min((_log_squares(like, rows({*out, e})).sum(), e) for e in doubtful)
         if left >= least:
             break
         out, least = {*out, worst}, left
     return out
 
 
-def _log_squares(fit: Fit, rows: Iterable[Array]) -> Array:
-    """Return half the log of the sum of squares of a residual, weighted as in ``fit``, by axis."""
-    weighted = (row * root for row, root in zip(rows, fit.likelihood.root, strict=True))
+def _log_squares(likelihood: Likelihood, rows: Iterable[Array]) -> Array:
+    """Return half the log of the weighted sum of squares of a residual, by axis, (n_q,)."""
+    weighted = (row * root for row, root in zip(rows, likelihood.root, strict=True))
     return 0.5 * np.log([max(float(row @ row), 1e-300) for row in weighted])
 
 
@@ -320,8 +320,9 @@ def gains_when_fitted(
     volume = search.volume_where_fitted(keys, after.linearisation)
     if volume is None:
         return -np.inf, -np.inf
+    like = before.likelihood
     with_set, without = [
-        [_log_squares(before, rows) for rows in (fit.rows_beyond_bias, fit.held_out_rows())]
+        [_log_squares(like, rows) for rows in (fit.rows_beyond_bias, fit.held_out_rows())]
         for fit in (after, before)
     ]
     seen, held_out = np.subtract(without, with_set)
@@ -386,14 +387,12 @@ def start_of(search: Search, keys: Sequence[Key], wider: ModelSpec) -> Array:
 
 
 def _misfit(search: Search, spec: ModelSpec, p: Array) -> float:
-    """Return the negative log likelihood of the trials at parameters ``p``, (n_p,), nats."""
+    """Return the misfit of the trials at parameters ``p``, (n_p,), nats up to a constant."""
     e, like, system = search.dictionary.linearisation, search.problem.likelihood, system_of(spec)
     rows = e.thin(lambda at: ModelOnTrial(system, p, [at.motion]).residual)
     left = (take_samples(rows, here, axis) for axis, here in enumerate(like.samples))
-    cost = search.problem.independent @ [
-        np.log(max(rms(x * root), 1e-300)) for x, root in zip(left, like.root, strict=True)
-    ]
-    return float(cost) if np.isfinite(cost) else np.inf
+    cost = float(search.problem.independent @ _log_squares(like, left))
+    return cost if np.isfinite(cost) else np.inf
 
 
 def start_at(search: Search, base: Array, known: Mapping[str, float], wider: ModelSpec) -> Array:

@@ -274,12 +274,12 @@ def describe_evidence(
     said = "; ".join(parts or back[:3])
     if after.unexplained is not None:
         return said
-    named = join_names([system.coordinates[i] for i in axes])
-    agree = f"weight, inertia and friction of {named} agree"
-    every = len(axes) == len(system.coordinates)
-    return (
-        f"with bodies as drawn, {said or ('all drives differ by one factor' if every else agree)}"
-    )
+    if not said:
+        named = join_names([system.coordinates[i] for i in axes])
+        agree = f"weight, inertia and friction of {named} agree"
+        every = len(axes) == len(system.coordinates)
+        said = "all drives differ by one factor" if every else agree
+    return f"with bodies as drawn, {said}"
 
 
 def _fall(axis: int, before: Plausibility, after: Plausibility) -> str:
