@@ -81,6 +81,7 @@ class Probabilities:
 
 def weigh_sets(
     by_noise: SetCosts,
+    costs: SetCosts,
     fit: Fit,
     pool: Pool,
     fitted: Mapping[tuple[str, ...], FittedSet],
@@ -90,21 +91,18 @@ def weigh_sets(
 ) -> Probabilities:
     """Compute the probabilities of the sets of a pool and of unknown functions beside them.
 
-    The number of independent samples is that of the noise for something unknown, and that of the
-    residual for effects.
-
     Args:
-        by_noise: costs of sets beside the most probable model; fit: that model.
+        by_noise: costs of something unknown beside the most probable model, by the number of
+            samples that are independent in its noise.
+        costs: costs of sets, by the number that are independent in its residual; fit: that model.
         pool: sets near it, with costs by the noise.
         fitted: those that have been fitted, by effects; their evidence is that of the fit.
         given: effects of the model diagnosed, which are not in question.
     """
-    costs = by_noise.with_independent(fit.count_independent(criteria))
-    # A fit may gain less than its linear problem promised, in the same proportion to the samples.
-    fewer = costs.problem.independent.sum() / max(by_noise.problem.independent.sum(), 1e-300)
     by_fit = {pool[n][1]: one for n, one in fitted.items() if n in pool}
-    at_noise, none = by_noise.cost(()), costs.cost(())
-    shortfall = {k: fewer * (at_noise - by_noise.cost(k) - s.gain) for k, s in by_fit.items()}
+    none = costs.cost(())
+    # A fit may gain less than its linear problem promised.
+    shortfall = {k: none - costs.cost(k) - s.gain for k, s in by_fit.items()}
     own = [e for e in costs.problem.absence if e not in given]
     bare = change_effects(fit.spec, own)
     weighed = sorted((costs.cost(k) + shortfall.get(k, 0.0), k) for _, k in pool.values() if k)

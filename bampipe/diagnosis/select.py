@@ -161,24 +161,27 @@ def select_effects(
         progress(0.1 + 0.1 * number, "weighing sets of effects")
         with open_search(session, current, {*without, *left_out}, known) as search:
             known = search
-            none = search.cost(())
             if not gains:
                 beside = search.rank_additions((), len(search.dictionary.candidates))
-                gains = {key[0]: none - cost for cost, key in beside}
+                gains = {key[0]: search.cost(()) - cost for cost, key in beside}
             room = session.criteria.most_effects - len(current.spec.effects) + len(spec.effects)
             pool = _explore(search, room, deep=room if number == 0 else min(_MOST_ADDED, room))
             moved, kept = None, dict[tuple[str, ...], FittedSet]()
             last |= number >= _MOST_ROUNDS - 1
+            # Beside something unknown, the residual recurs: fewer of its samples tell sets apart.
+            costs = search.with_independent(current.count_independent(session.criteria))
+            pool = {name: (costs.cost(keys), keys) for name, (_, keys) in pool.items()}
+            none = costs.cost(())
             if not last:
                 # The bias of the present replicates may hide an effect that only its prior rejects.
                 better = [
                     keys
                     for cost, keys in sorted(pool.values())
-                    if keys and cost < none + max(search.penalty_of(keys), -_LEAST_GAIN)
+                    if keys and cost < none + max(costs.penalty_of(keys), -_LEAST_GAIN)
                 ]
-                better += _without_weakest(search, spec.effects)
+                better += _without_weakest(costs, spec.effects)
                 tell = partial(progress, 0.15 + 0.1 * number)
-                moved, kept = _fit_better(session, search, current, better, fits, tell)
+                moved, kept = _fit_better(session, costs, current, better, fits, tell)
                 # Under the noise of its own replicates, an earlier set may seem better again.
                 last |= any(moved is one for one in earlier)
             if moved is None:
@@ -189,7 +192,7 @@ def select_effects(
                 progress(0.9, "comparing the gains with those on replicates")
                 replicate_gains = search.replicate_gains()
                 probabilities = weigh_sets(
-                    search, current, pool, kept, spec.effects, session.criteria, session.seed
+                    search, costs, current, pool, kept, spec.effects, session.criteria, session.seed
                 )
                 if number < _MOST_ROUNDS:
                     moved = _leave_out(session, search, current, probabilities, spec.effects)
@@ -326,7 +329,7 @@ def gains_when_fitted(
         for fit in (after, before)
     ]
     seen, held_out = np.subtract(without, with_set)
-    independent = before.problem.independent
+    independent = search.problem.independent
     gain = float(independent @ seen + volume.sum()) - search.solve(keys).penalty
     return gain, float(np.sum(held_out + volume / np.maximum(independent, 1e-300)))
 
