@@ -307,9 +307,15 @@ class Session:
                     is_coarse = 2.0 * np.pi * highest_hz * abs(step[count]) > _COARSE_SHIFT
                     late_s = is_coarse * float(step[count])
                 try:
-                    moved = self.linearise(spec, p, linearisation, late_s=late_s)
-                    tried = pose_problem(likelihood, moved)
-                    there = tried.solve_nuisance(count).cost
+                    # The residual without its slopes shows most steps that are too long.
+                    there = -np.inf
+                    if not linearisation.factors:
+                        rows = linearisation.residual_at(p)
+                        there = problem.cost_of_step(rows, solved.base, count)
+                    if there < here:
+                        moved = self.linearise(spec, p, linearisation, late_s=late_s)
+                        tried = pose_problem(likelihood, moved)
+                        there = tried.solve_nuisance(count).cost
                 except NotFinite:
                     there = np.inf
                 if there < here:

@@ -296,6 +296,27 @@ class LinearProblem:
         roots = [float(np.mean(np.log(r))) if r.size else 0.0 for r in self.likelihood.root]
         return float(self.independent @ roots) - self.solve().cost
 
+    def cost_of_step(self, residual: Sequence[Array], change: Array, count: int) -> float:
+        """Negative log density after a step, nats; infinite if the residual there is not finite.
+
+        Priors and the scale of the equation are those of the linear problem.
+
+        Args:
+            residual: after the step, by trial, each (K, n_q), N.m or N.
+            change: the step, (P,); its nuisance parameters are fitted anew.
+            count: number of the model's parameters.
+        """
+        like = self.likelihood
+        weighed = zip(like.samples, like.root, self.base, strict=True)
+        y = [
+            take_samples(residual, here, axis) * root - base @ change
+            for axis, (here, root, base) in enumerate(weighed)
+        ]
+        if not all(np.isfinite(rows).all() for rows in y):
+            return np.inf
+        moved, steps = replace(self, y=y), self.to_parameters[:count] @ change
+        return solve_bounded(moved, *moved.sums(), absent=dict(enumerate(steps.tolist()))).cost
+
     def solve_nuisance(self, count: int) -> "LinearSolution":
         """The most likely nuisance parameters while the model's ``count`` parameters stay."""
         return solve_bounded(self, *self.sums(), absent=dict.fromkeys(range(count), 0.0))
