@@ -53,16 +53,6 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
 
 
 @part()
-def _advance(x, step):  # type: ignore[no-untyped-def]
-    """Advance state ``x`` (n,) by one sample, in place."""
-    for i in range(x.shape[0]):
-        total = 0.0
-        for j in range(i, x.shape[0]):
-            total += step[i, j] * x[j]
-        x[i] = total
-
-
-@part()
 def _multiply_row(matrix, i, vector):  # type: ignore[no-untyped-def]
     """Row ``i`` of ``matrix`` (n, n) times ``vector`` (n,)."""
     total = 0.0
@@ -72,23 +62,25 @@ def _multiply_row(matrix, i, vector):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _predict(x, p, step, noise, work):  # type: ignore[no-untyped-def]
-    """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
+def _advance(x, step, work):  # type: ignore[no-untyped-def]
+    """Replace ``x`` (n,) by ``step`` (n, n) times it."""
+    for i in range(x.shape[0]):
+        work[0, i] = _multiply_row(step, i, x)
+    for i in range(x.shape[0]):
+        x[i] = work[0, i]
+
+
+@part()
+def _advance_both(x, p, step, work):  # type: ignore[no-untyped-def]
+    """Replace ``x`` (n,) by ``step`` (n, n) times it, and symmetric ``p`` by step p step'."""
     n = x.shape[0]
-    _advance(x, step)
+    _advance(x, step, work)
     for i in range(n):
         for j in range(n):
-            total = 0.0
-            for k in range(i, n):
-                total += step[i, k] * p[k, j]
-            work[i, j] = total
+            work[i, j] = _multiply_row(p, j, step[i])
     for i in range(n):
         for j in range(i + 1):
-            total = noise[i, j]
-            for k in range(j, n):
-                total += work[i, k] * step[j, k]
-            p[i, j] = total
-            p[j, i] = total
+            p[i, j] = p[j, i] = _multiply_row(step, j, work[i])
 
 
 @part()
@@ -126,14 +118,15 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
     settled = False
     for t in range(count):
         if settled and present[t]:
-            _advance(x, step)
+            _advance(x, step, work)
             innovations[t], spreads[t] = y[t] - x[0], spreads[t - 1]
             for i in range(n):
                 gains[t, i] = gains[t - 1, i]
                 x[i] += gains[t, i] * innovations[t]
         else:
             if t > 0:
-                _predict(x, p, step, noise, work)
+                _advance_both(x, p, step, work)
+                p += noise
             if present[t]:
                 innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
             settled = present[t] and t > 4 * n
@@ -147,12 +140,15 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
 
 
 @njit(void(_FLAGS, _M, _PASS, _M))
-def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
-    """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n)."""
+def _smooth(present, back, passed, variances):  # type: ignore[no-untyped-def]
+    """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n).
+
+    ``back`` is the transposed transition matrix (n, n).
+    """
     states, covariances, gains, innovations, spreads = passed
     n = states.shape[1]
     adjoint, pull = np.zeros(n), np.zeros(n)
-    weight, left = np.zeros((n, n)), np.empty((n, n))
+    weight, work = np.zeros((n, n)), np.empty((n, n))
     for t in range(states.shape[0] - 1, -1, -1):
         p = covariances[t]
         for i in range(n):
@@ -177,24 +173,7 @@ def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
                 weight[i, 0] -= pull[i]
                 weight[0, i] -= pull[i]
         # adjoint <- F' adjoint, weight <- F' weight F
-        for i in range(n - 1, -1, -1):
-            total = 0.0
-            for j in range(i + 1):
-                total += step[j, i] * adjoint[j]
-            adjoint[i] = total
-        for i in range(n):
-            for j in range(n):
-                total = 0.0
-                for k in range(j + 1):
-                    total += weight[i, k] * step[k, j]
-                left[i, j] = total
-        for i in range(n):
-            for j in range(i + 1):
-                total = 0.0
-                for k in range(i + 1):
-                    total += step[k, i] * left[k, j]
-                weight[i, j] = total
-                weight[j, i] = total
+        _advance_both(adjoint, weight, back, work)
 
 
 def _prior(y: Array, order: int) -> tuple[Array, Array]:
@@ -264,7 +243,7 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     start, spread = _informed_prior(y, present, step, model.ratio * noise)
     passed = _filter(y, present, step, model.ratio * noise, start, spread)
     variances = np.empty((count, order))
-    _smooth(present, step, passed, variances)
+    _smooth(present, step.T.copy(), passed, variances)
     scale = model.noise_sd * model.rate_hz ** np.arange(3)
     x, sd = passed[0][:, :3] * scale, np.sqrt(variances[:, :3]) * scale
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
