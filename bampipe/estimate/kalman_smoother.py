@@ -54,7 +54,7 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
 
 @part()
 def _multiply_row(matrix, i, vector):  # type: ignore[no-untyped-def]
-    """Row ``i`` of ``matrix`` (n, n) times ``vector`` (n,)."""
+    """Row ``i`` of ``matrix`` (m, n) times ``vector`` (n,)."""
     total = 0.0
     for j in range(vector.shape[0]):
         total += matrix[i, j] * vector[j]
@@ -71,34 +71,15 @@ def _advance(x, step, work):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _advance_both(x, p, step, work):  # type: ignore[no-untyped-def]
-    """Replace ``x`` (n,) by ``step`` (n, n) times it, and symmetric ``p`` by step p step'."""
-    n = x.shape[0]
-    _advance(x, step, work)
+def _advance_matrix(p, step, work):  # type: ignore[no-untyped-def]
+    """Replace ``p`` (n, n), which is symmetric, by ``step`` (n, n) p step'."""
+    n = p.shape[0]
     for i in range(n):
         for j in range(n):
             work[i, j] = _multiply_row(p, j, step[i])
     for i in range(n):
         for j in range(i + 1):
             p[i, j] = p[j, i] = _multiply_row(step, j, work[i])
-
-
-@part()
-def _update(x, p, y, gain):  # type: ignore[no-untyped-def]
-    """Take in one sample ``y`` of noise 1, in place; return innovation and its variance."""
-    n = x.shape[0]
-    spread = p[0, 0] + 1.0
-    innovation = y - x[0]
-    for i in range(n):
-        gain[i] = p[i, 0] / spread
-    for i in range(n):
-        x[i] += gain[i] * innovation
-    for i in range(n):
-        for j in range(i + 1):
-            value = p[i, j] - gain[i] * gain[j] * spread
-            p[i, j] = value
-            p[j, i] = value
-    return innovation, spread
 
 
 _PASS = types.Tuple((_M, float64[:, :, ::1], _M, _V, _V))
@@ -117,22 +98,29 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
     innovations, spreads, work = np.zeros(count), np.ones(count), np.empty((n, n))
     settled = False
     for t in range(count):
-        if settled and present[t]:
+        settled = settled and present[t]
+        if t > 0:
             _advance(x, step, work)
-            innovations[t], spreads[t] = y[t] - x[0], spreads[t - 1]
+        if settled:
+            spreads[t] = spreads[t - 1]
             for i in range(n):
                 gains[t, i] = gains[t - 1, i]
-                x[i] += gains[t, i] * innovations[t]
         else:
             if t > 0:
-                _advance_both(x, p, step, work)
+                _advance_matrix(p, step, work)
                 p += noise
             if present[t]:
-                innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
-            settled = present[t] and t > 4 * n
-            for i in range(n):
-                settled &= abs(gains[t, i] - gains[t - 1, i]) < _SETTLED * abs(gains[t, i])
+                spreads[t], settled = p[0, 0] + 1.0, t > 4 * n
+                for i in range(n):
+                    gains[t, i] = p[i, 0] / spreads[t]
+                    settled &= abs(gains[t, i] - gains[t - 1, i]) < _SETTLED * abs(gains[t, i])
+                for i in range(n):
+                    for j in range(n):
+                        p[i, j] -= gains[t, i] * gains[t, j] * spreads[t]
+        if present[t]:
+            innovations[t] = y[t] - x[0]
         for i in range(n):
+            x[i] += gains[t, i] * innovations[t]
             states[t, i] = x[i]
             for j in range(n):
                 covariances[t, i, j] = p[i, j]
@@ -159,21 +147,16 @@ def _smooth(present, back, passed, variances):  # type: ignore[no-untyped-def]
             variances[t, i] = max(variance, 0.0)
         if present[t]:
             # adjoint <- C' adjoint - H' v/S, weight <- C' weight C + H' H/S, with C = I - K H
-            share = 0.0
-            for j in range(n):
-                share += gains[t, j] * adjoint[j]
-            adjoint[0] -= share + innovations[t] / spreads[t]
+            adjoint[0] -= _multiply_row(gains, t, adjoint) + innovations[t] / spreads[t]
             for i in range(n):
                 pull[i] = _multiply_row(weight, i, gains[t])
-            share = 0.0
-            for i in range(n):
-                share += gains[t, i] * pull[i]
-            weight[0, 0] += share + 1.0 / spreads[t]
+            weight[0, 0] += _multiply_row(gains, t, pull) + 1.0 / spreads[t]
             for i in range(n):
                 weight[i, 0] -= pull[i]
                 weight[0, i] -= pull[i]
         # adjoint <- F' adjoint, weight <- F' weight F
-        _advance_both(adjoint, weight, back, work)
+        _advance(adjoint, back, work)
+        _advance_matrix(weight, back, work)
 
 
 def _prior(y: Array, order: int) -> tuple[Array, Array]:
