@@ -12,7 +12,6 @@ from bampipe.report import style
 from bampipe.report.document import Block, Figure, Formulas, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_quantity, format_unit, split_name
-from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult, WorstWindow
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.terms import ModelTerm, TermCurve, TermsResult
@@ -138,9 +137,8 @@ def _find_window(
 
     With it, the effects that were added, and the residuals without and with them.
     """
-    compared = results.read(CompareResult)
-    rungs = compared.ladder if compared else ()
-    rung = next((one for one in rungs if term.name in (one.added or "").split(", ")), None)
+    adding = (one for one in results.ladder if term.name in (one.added or "").split(", "))
+    rung = next(adding, None)
     diagnosis = results.read(DiagnoseResult, rung.parent) if rung and rung.parent else None
     if rung is None or rung.parent is None or diagnosis is None:
         return None
