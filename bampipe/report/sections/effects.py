@@ -77,10 +77,8 @@ def _draw_curves(name: str, curves: Sequence[TermCurve], caption: str) -> Figure
 
 
 def _draw_curve(panel: Axes, curve: TermCurve) -> None:
-    band = (curve.center, curve.mean, curve.low, curve.high)
-    style.draw_curve(panel, band, curve.variable, curve.variable_unit, marker=".", ms=3.0)
-    kind = "torque" if curve.unit.startswith("N.m") else "force"
-    panel.set(title=curve.axis, ylabel=style.label_axis(f"{kind} taken", curve.unit))
+    style.draw_curve(panel, curve, curve.center, " taken", marker=".", ms=3.0)
+    panel.set_title(curve.axis)
 
 
 def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator[Block]:
