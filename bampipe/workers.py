@@ -8,6 +8,7 @@ import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -62,39 +63,41 @@ def process_pool(
     Args:
         initialize: called in each process before its first task, with ``arguments``.
         nested: whether tasks start processes of their own; the workers then begin afresh.
-        hear: called with every message of `send_to_parent`.
+        hear: called with every message of `send_to_parent`, one at a time.
     """
-    workers: list[_Worker] = []
-
-    def start() -> None:
-        workers.append(_Worker(initialize, arguments, nested))
-
+    pool = ProcessPool(jobs, lambda: _Worker(initialize, arguments, nested), hear)
     try:
-        for _ in range(jobs):
-            start()
-        yield ProcessPool(workers, start, hear)
+        for _ in range(jobs):  # forked before there are threads
+            pool.start()
+        yield pool
     finally:
-        for worker in workers:
-            worker.process.kill()
-        for worker in workers:
-            worker.process.join()
-            worker.pipe.close()
+        pool.close()
 
 
 class ProcessPool:
-    """Deals tasks to worker processes.
+    """Deals tasks to worker processes, each of which a thread waits for.
 
-    The executor of the standard library is unsuitable: an exception in the block, such as that of
-    Ctrl-C, waits for every task, or for ever while the processes start.
+    The executor of processes of the standard library is unsuitable: an exception in the block, such
+    as that of Ctrl-C, waits for every task, and the death of one worker ends them all.
     """
 
     def __init__(
-        self, workers: "list[_Worker]", start: Callable[[], None], hear: Callable[[Any], None]
+        self, jobs: int, make: "Callable[[], _Worker]", hear: Callable[[Any], None]
     ) -> None:
-        self._workers, self._start, self._hear = workers, start, hear
-        self._waiting: deque[_Task] = deque()
-        self._results: dict[int, _Reply] = {}
-        self._number = 0
+        self._make, self._hear, self._lock = make, hear, threading.Lock()
+        self._own, self._workers, self._closing = threading.local(), list[_Worker](), False
+        fresh = iter(self._workers)
+        self._threads = ThreadPoolExecutor(
+            jobs, initializer=lambda: setattr(self._own, "worker", next(fresh))
+        )
+
+    def start(self) -> "_Worker":
+        """Start a worker, unless the pool is being closed."""
+        with self._lock:
+            if self._closing:
+                raise CancelledError
+            self._workers.append(self._make())
+            return self._workers[-1]
 
     def map(
         self,
@@ -114,65 +117,43 @@ class ProcessPool:
             InputError: a worker process was killed, and there is no ``lost``.
             Exception: what ``function`` raised, with the traceback of the worker as a note.
         """
-        first = self._number
-        for task in tasks:
-            self._waiting.append(_Task(self._number, function, task, lost))
-            self._number += 1
-        self._deal()
-        return self._in_order(range(first, self._number))
+        futures = deque(self._threads.submit(self._call, function, task, lost) for task in tasks)
+        return (futures.popleft().result() for _ in range(len(futures)))
 
-    def _in_order(self, numbers: range) -> Iterator[Any]:
-        for number in numbers:
-            while number not in self._results:
-                self._collect()
-            value, error = self._results.pop(number)
-            if error is not None:
-                raise error
-            yield value
+    def _call(
+        self,
+        function: Callable[[Task], Returned],
+        task: Task,
+        lost: Callable[[Task, InputError], Returned] | None,
+    ) -> Returned:
+        """In a thread: have its worker do a task."""
+        self._own.worker = worker = self._own.worker or self.start()
+        try:
+            worker.pipe.send((function, task))
+            while isinstance(answer := worker.pipe.recv(), _Message):
+                with self._lock:
+                    self._hear(answer.content)
+        except (BrokenPipeError, EOFError, ConnectionResetError) as error:
+            fault = worker.lost()
+            if lost is None or self._closing:
+                raise fault from error
+            self._own.worker = None
+            return lost(task, fault)
+        value, failure = answer
+        if failure is not None:
+            raise failure
+        return value  # type: ignore[no-any-return]
 
-    def _deal(self) -> None:
+    def close(self) -> None:
+        """End the worker processes, whatever they are at."""
+        with self._lock:
+            self._closing = True
         for worker in self._workers:
-            if worker.task is None and self._waiting:
-                worker.task = self._waiting.popleft()
-                try:
-                    worker.pipe.send((worker.task.function, worker.task.argument))
-                except BrokenPipeError as error:
-                    raise worker.lost() from error
-
-    def _collect(self) -> None:
-        """Wait until a worker is done, and give it what comes next."""
-        busy = {worker.pipe: worker for worker in self._workers if worker.task is not None}
-        for pipe in multiprocessing.connection.wait(list(busy)):
-            worker = busy[pipe]  # type: ignore[index]
-            task = worker.task
-            assert task is not None
-            try:
-                answer = worker.pipe.recv()
-            except (EOFError, ConnectionResetError) as error:
-                if task.lost is None:
-                    raise worker.lost() from error
-                self._results[task.number] = task.lost(task.argument, worker.lost()), None
-                self._workers.remove(worker)
-                worker.pipe.close()
-                if self._waiting:
-                    self._start()
-                continue
-            if isinstance(answer, _Message):
-                self._hear(answer.content)
-                continue
-            self._results[task.number] = answer
-            worker.task = None
-        self._deal()
-
-
-@dataclass(frozen=True)
-class _Task:
-    """A call in a worker, and the replacement of its result if the worker is killed."""
-
-    number: int
-    function: Callable[[Any], Any]
-    argument: Any
-    lost: Callable[[Any, InputError], Any] | None
+            worker.process.kill()
+        self._threads.shutdown(cancel_futures=True)
+        for worker in self._workers:
+            worker.process.join()
+            worker.pipe.close()
 
 
 @dataclass(frozen=True)
@@ -182,11 +163,8 @@ class _Message:
     content: object
 
 
-_Reply = tuple[object, Exception | None]
-
-
 class _Worker:
-    """A worker process, the pipe to it, and the task it is at."""
+    """A worker process and the pipe to it."""
 
     def __init__(
         self, initialize: Callable[..., object], arguments: tuple[Any, ...], nested: bool
@@ -198,7 +176,6 @@ class _Worker:
         )
         self.process.start()
         far.close()
-        self.task: _Task | None = None
 
     def lost(self) -> InputError:
         self.process.join()
@@ -219,7 +196,7 @@ def _serve(
     initialize(*arguments)
     while True:
         function, task = pipe.recv()
-        reply: _Reply
+        reply: tuple[object, Exception | None]
         try:
             reply = (function(task), None)
         except Exception as error:

@@ -43,38 +43,32 @@ def _close(  # type: ignore[no-untyped-def]
     p, w = plant.p, plant.w
     nu, nr, nf = u.shape[1], r.shape[1], columns.shape[0]
     start, end, given, straight = np.empty(nu), np.empty(nu), np.empty(nr), np.zeros(nu)
-    out, work = np.empty(nf + states.shape[0]), np.zeros((8, max(x.shape[1], nu)))
+    out, work = np.zeros(nf + states.shape[0]), np.zeros((8, max(x.shape[1], nu)))
     tick_s = dt / ticks
     for k in range(x.shape[0]):
-        if k > 0:
-            for j in range(nf):  # the encoders may be moved by the load
-                u[k, columns[j]] = out[j]
-        measure(x[k], u[k], p, readings[k])
-        _act(command, states, limits, readings[k], r[k], tick_s, out)
-        for j in range(nf):
-            u[k, columns[j]] = out[j]
-        if k + 1 == x.shape[0]:
-            break
+        ahead = min(k + 1, x.shape[0] - 1)  # at the last sample, the controller only acts
         for i in range(x.shape[1]):  # a slice that is assigned takes seconds to compile
-            x[k + 1, i] = x[k, i]
-        for tick in range(ticks):
+            x[ahead, i] = x[k, i]
+        for tick in range(ticks if k < ahead else 1):
             for j in range(nu):
-                start[j] = u[k, j] + (u[k + 1, j] - u[k, j]) * tick / ticks
-                end[j] = u[k, j] + (u[k + 1, j] - u[k, j]) * (tick + 1) / ticks
-            for j in range(nf):
+                start[j] = u[k, j] + (u[ahead, j] - u[k, j]) * tick / ticks
+                end[j] = u[k, j] + (u[ahead, j] - u[k, j]) * (tick + 1) / ticks
+            for j in range(nr):
+                given[j] = r[k, j] + (r[ahead, j] - r[k, j]) * tick / ticks
+            for j in range(nf):  # the encoders may be moved by the load
                 start[columns[j]] = out[j]
-            if tick > 0:
-                for j in range(nr):
-                    given[j] = r[k, j] + (r[k + 1, j] - r[k, j]) * tick / ticks
-                measure(x[k + 1], start, p, readings[k + 1])
-                _act(command, states, limits, readings[k + 1], given, tick_s, out)
+            seen = readings[ahead if tick > 0 else k]
+            measure(x[ahead], start, p, seen)
+            _act(command, states, limits, seen, given, tick_s, out)
             for j in range(nf):
-                start[columns[j]] = out[j]
-                end[columns[j]] = out[j]
-            steps = stable_steps(derivative, x[k + 1], start, plant, tick_s, work)
-            runge_kutta(
-                derivative, x[k + 1], start, end, straight, straight, p, w, tick_s, steps, work
-            )
+                start[columns[j]] = end[columns[j]] = out[j]
+                if tick == 0:
+                    u[k, columns[j]] = out[j]
+            if k < ahead:
+                steps = stable_steps(derivative, x[ahead], start, plant, tick_s, work)
+                runge_kutta(
+                    derivative, x[ahead], start, end, straight, straight, p, w, tick_s, steps, work
+                )
 
 
 def simulate_controlled(

@@ -7,8 +7,6 @@ If some windows are known to be good, a gamma distribution with their mean and v
 used, of which chi-squared is a special case.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.special import gammaincinv
 
@@ -21,40 +19,19 @@ FEWEST_WINDOWS = 10
 """Smallest number of good windows whose scatter is used."""
 
 
-@dataclass(frozen=True)
-class Reference:
-    """Distribution of the mean NIS per reading over a window: a gamma distribution.
+def find_threshold(probability: float, readings: int, good: Array | None = None) -> float:
+    """Return the mean NIS per reading that a consistent window exceeds with ``probability``.
 
-    Attributes:
-        shape, scale: parameters; their product is the mean, 1 for a filter with the right noise.
+    Args:
+        readings: number in a window.
+        good: (n,) means over good windows, to which the distribution is fitted, with at least the
+            variance of theory at their mean; fewer than `FEWEST_WINDOWS` leave that of theory.
     """
-
-    shape: float
-    scale: float
-
-    @staticmethod
-    def of_theory(readings: int) -> "Reference":
-        """Chi-squared with ``readings`` degrees of freedom, over ``readings``."""
-        return Reference(readings / 2.0, 2.0 / readings)
-
-    @staticmethod
-    def of_windows(means: Array, readings: int) -> "Reference":
-        """Fit the distribution to good windows; fewer than `FEWEST_WINDOWS` give `of_theory`.
-
-        Args:
-            means: (n,) mean NIS per reading over each window.
-            readings: number in a window. The variance is at least that of theory at this mean.
-        """
-        theory = Reference.of_theory(readings)
-        if means.size < FEWEST_WINDOWS:
-            return theory
-        mean = float(np.mean(means))
-        variance = max(float(np.var(means, ddof=1)), 2.0 * mean**2 / readings)
-        return Reference(mean**2 / variance, variance / mean)
-
-    def threshold(self, probability: float) -> float:
-        """Return the threshold that a consistent window exceeds with ``probability``."""
-        return float(self.scale * gammaincinv(self.shape, 1.0 - probability))
+    mean, variance = 1.0, 2.0 / readings
+    if good is not None and good.size >= FEWEST_WINDOWS:
+        mean = float(np.mean(good))
+        variance = max(float(np.var(good, ddof=1)), 2.0 * mean**2 / readings)
+    return float(variance / mean * gammaincinv(mean**2 / variance, 1.0 - probability))
 
 
 def window_means(nis: Array, n_readings: int, samples: int) -> Array:

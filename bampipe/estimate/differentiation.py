@@ -6,7 +6,7 @@ differences (:mod:`bampipe.estimate.butterworth`), and a Kalman smoother of an i
 noise (:mod:`bampipe.estimate.kalman_smoother`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -133,11 +133,8 @@ def uniform_grid(t: Array, rate_hz: float) -> UniformGrid:
     count = int(np.floor((t[-1] - t[0]) / step + 0.02)) + 1
     grid = t[0] + step * np.arange(count)
     exact = count == len(t) and bool(np.all(np.abs(grid - t) < 0.02 * step))
-    if exact:
-        return UniformGrid(grid, np.zeros(count, dtype=bool), True, t)
-    after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
-    nearest = np.minimum(np.abs(grid - t[after - 1]), np.abs(t[after] - grid))
-    return UniformGrid(grid, nearest >= step, False, t)
+    found = UniformGrid(grid, np.zeros(count, dtype=bool), exact, t)
+    return replace(found, bridged=np.abs(found.stamp_offset) >= step)
 
 
 def extend(values: Array, reach: int, fit: int) -> Array:

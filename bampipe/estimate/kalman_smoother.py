@@ -53,18 +53,8 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
 
 
 @part()
-def _advance(x, step):  # type: ignore[no-untyped-def]
-    """Advance state ``x`` (n,) by one sample, in place."""
-    for i in range(x.shape[0]):
-        total = 0.0
-        for j in range(i, x.shape[0]):
-            total += step[i, j] * x[j]
-        x[i] = total
-
-
-@part()
 def _multiply_row(matrix, i, vector):  # type: ignore[no-untyped-def]
-    """Row ``i`` of ``matrix`` (n, n) times ``vector`` (n,)."""
+    """Row ``i`` of ``matrix`` (m, n) times ``vector`` (n,)."""
     total = 0.0
     for j in range(vector.shape[0]):
         total += matrix[i, j] * vector[j]
@@ -72,41 +62,24 @@ def _multiply_row(matrix, i, vector):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _predict(x, p, step, noise, work):  # type: ignore[no-untyped-def]
-    """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
-    n = x.shape[0]
-    _advance(x, step)
-    for i in range(n):
-        for j in range(n):
-            total = 0.0
-            for k in range(i, n):
-                total += step[i, k] * p[k, j]
-            work[i, j] = total
-    for i in range(n):
-        for j in range(i + 1):
-            total = noise[i, j]
-            for k in range(j, n):
-                total += work[i, k] * step[j, k]
-            p[i, j] = total
-            p[j, i] = total
+def _advance(x, step, work):  # type: ignore[no-untyped-def]
+    """Replace ``x`` (n,) by ``step`` (n, n) times it."""
+    for i in range(x.shape[0]):
+        work[0, i] = _multiply_row(step, i, x)
+    for i in range(x.shape[0]):
+        x[i] = work[0, i]
 
 
 @part()
-def _update(x, p, y, gain):  # type: ignore[no-untyped-def]
-    """Take in one sample ``y`` of noise 1, in place; return innovation and its variance."""
-    n = x.shape[0]
-    spread = p[0, 0] + 1.0
-    innovation = y - x[0]
+def _advance_matrix(p, step, work):  # type: ignore[no-untyped-def]
+    """Replace ``p`` (n, n), which is symmetric, by ``step`` (n, n) p step'."""
+    n = p.shape[0]
     for i in range(n):
-        gain[i] = p[i, 0] / spread
-    for i in range(n):
-        x[i] += gain[i] * innovation
+        for j in range(n):
+            work[i, j] = _multiply_row(p, j, step[i])
     for i in range(n):
         for j in range(i + 1):
-            value = p[i, j] - gain[i] * gain[j] * spread
-            p[i, j] = value
-            p[j, i] = value
-    return innovation, spread
+            p[i, j] = p[j, i] = _multiply_row(step, j, work[i])
 
 
 _PASS = types.Tuple((_M, float64[:, :, ::1], _M, _V, _V))
@@ -125,21 +98,29 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
     innovations, spreads, work = np.zeros(count), np.ones(count), np.empty((n, n))
     settled = False
     for t in range(count):
-        if settled and present[t]:
-            _advance(x, step)
-            innovations[t], spreads[t] = y[t] - x[0], spreads[t - 1]
+        settled = settled and present[t]
+        if t > 0:
+            _advance(x, step, work)
+        if settled:
+            spreads[t] = spreads[t - 1]
             for i in range(n):
                 gains[t, i] = gains[t - 1, i]
-                x[i] += gains[t, i] * innovations[t]
         else:
             if t > 0:
-                _predict(x, p, step, noise, work)
+                _advance_matrix(p, step, work)
+                p += noise
             if present[t]:
-                innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
-            settled = present[t] and t > 4 * n
-            for i in range(n):
-                settled &= abs(gains[t, i] - gains[t - 1, i]) < _SETTLED * abs(gains[t, i])
+                spreads[t], settled = p[0, 0] + 1.0, t > 4 * n
+                for i in range(n):
+                    gains[t, i] = p[i, 0] / spreads[t]
+                    settled &= abs(gains[t, i] - gains[t - 1, i]) < _SETTLED * abs(gains[t, i])
+                for i in range(n):
+                    for j in range(n):
+                        p[i, j] -= gains[t, i] * gains[t, j] * spreads[t]
+        if present[t]:
+            innovations[t] = y[t] - x[0]
         for i in range(n):
+            x[i] += gains[t, i] * innovations[t]
             states[t, i] = x[i]
             for j in range(n):
                 covariances[t, i, j] = p[i, j]
@@ -147,12 +128,15 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
 
 
 @njit(void(_FLAGS, _M, _PASS, _M))
-def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
-    """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n)."""
+def _smooth(present, back, passed, variances):  # type: ignore[no-untyped-def]
+    """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n).
+
+    ``back`` is the transposed transition matrix (n, n).
+    """
     states, covariances, gains, innovations, spreads = passed
     n = states.shape[1]
     adjoint, pull = np.zeros(n), np.zeros(n)
-    weight, left = np.zeros((n, n)), np.empty((n, n))
+    weight, work = np.zeros((n, n)), np.empty((n, n))
     for t in range(states.shape[0] - 1, -1, -1):
         p = covariances[t]
         for i in range(n):
@@ -163,38 +147,16 @@ def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
             variances[t, i] = max(variance, 0.0)
         if present[t]:
             # adjoint <- C' adjoint - H' v/S, weight <- C' weight C + H' H/S, with C = I - K H
-            share = 0.0
-            for j in range(n):
-                share += gains[t, j] * adjoint[j]
-            adjoint[0] -= share + innovations[t] / spreads[t]
+            adjoint[0] -= _multiply_row(gains, t, adjoint) + innovations[t] / spreads[t]
             for i in range(n):
                 pull[i] = _multiply_row(weight, i, gains[t])
-            share = 0.0
-            for i in range(n):
-                share += gains[t, i] * pull[i]
-            weight[0, 0] += share + 1.0 / spreads[t]
+            weight[0, 0] += _multiply_row(gains, t, pull) + 1.0 / spreads[t]
             for i in range(n):
                 weight[i, 0] -= pull[i]
                 weight[0, i] -= pull[i]
         # adjoint <- F' adjoint, weight <- F' weight F
-        for i in range(n - 1, -1, -1):
-            total = 0.0
-            for j in range(i + 1):
-                total += step[j, i] * adjoint[j]
-            adjoint[i] = total
-        for i in range(n):
-            for j in range(n):
-                total = 0.0
-                for k in range(j + 1):
-                    total += weight[i, k] * step[k, j]
-                left[i, j] = total
-        for i in range(n):
-            for j in range(i + 1):
-                total = 0.0
-                for k in range(i + 1):
-                    total += step[k, i] * left[k, j]
-                weight[i, j] = total
-                weight[j, i] = total
+        _advance(adjoint, back, work)
+        _advance_matrix(weight, back, work)
 
 
 def _prior(y: Array, order: int) -> tuple[Array, Array]:
@@ -264,7 +226,7 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     start, spread = _informed_prior(y, present, step, model.ratio * noise)
     passed = _filter(y, present, step, model.ratio * noise, start, spread)
     variances = np.empty((count, order))
-    _smooth(present, step, passed, variances)
+    _smooth(present, step.T.copy(), passed, variances)
     scale = model.noise_sd * model.rate_hz ** np.arange(3)
     x, sd = passed[0][:, :3] * scale, np.sqrt(variances[:, :3]) * scale
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])

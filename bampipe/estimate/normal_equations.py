@@ -5,7 +5,7 @@ of trials, with any weights of the axes and any bounds, is then solved without a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -63,13 +63,11 @@ class NormalEquations:
         prior = [np.append(part, free) for part in (precision, known)]
         return cls(np.array(xx), np.array(xy), np.array(yy), count, *prior)
 
-    def subset(self, trials: Sequence[int]) -> "NormalEquations":
+    def subset(self, trials: Sequence[int]) -> Self:
         """The sums of some trials."""
         chosen = list(trials)
-        return NormalEquations(
-            self.xx[chosen], self.xy[chosen], self.yy[chosen], self.count[chosen],
-            self.precision, self.known,
-        )  # fmt: skip
+        parts = {name: getattr(self, name)[chosen] for name in ("xx", "xy", "yy", "count")}
+        return replace(self, **parts)
 
     def solve(self, weight: Array, lower: Array, upper: Array) -> Array:
         """Weighted least squares over all trials within bounds, (P,); see `solve_bounded`.

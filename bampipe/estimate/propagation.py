@@ -88,12 +88,8 @@ def _spread_parameters(estimated, mean, factor, reach, pairs, first, count, padd
     for j in range(free.shape[0]):
         at = free[j] * ROWS
         _spread(p, at, mean[nx + j], reach, factor[nx + j], n, pairs, first, count, padded)
-        if lower[j] > -np.inf:
-            for r in range(at, at + padded):
-                p[r] = max(p[r], lower[j])
-        if upper[j] < np.inf:
-            for r in range(at, at + padded):
-                p[r] = min(p[r], upper[j])
+        for r in range(at, at + padded):
+            p[r] = min(max(p[r], lower[j]), upper[j])
         if logarithmic[j]:
             for r in range(at, at + padded):
                 p[r] = np.exp(p[r])

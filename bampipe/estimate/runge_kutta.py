@@ -2,19 +2,10 @@
 
 from numba import float64, int64, void
 
-from bampipe.compiled import njit, part
+from bampipe.compiled import njit
 from bampipe.model_functions import DERIVATIVE
 
 _V = float64[::1]
-
-
-@part()
-def _read_input(u0, u1, c0, c1, dt, share, u):  # type: ignore[no-untyped-def]
-    """Write the input ``u`` (nu,) after a share of the interval."""
-    rest = 1.0 - share
-    before, after = rest * (rest * rest - 1.0), share * (share * share - 1.0)
-    for i in range(u.shape[0]):
-        u[i] = u0[i] + (u1[i] - u0[i]) * share + dt * dt / 6.0 * (c0[i] * before + c1[i] * after)
 
 
 @njit(void(DERIVATIVE, *[_V] * 7, float64, int64, float64[:, ::1]))
@@ -35,28 +26,20 @@ def runge_kutta(derivative, x, u0, u1, c0, c1, p, w, dt, substeps, work):  # typ
         substeps: number n of steps of size delta = dt / n.
         work: (6, >= max(nx, nu)) scratch.
     """
-    nx = x.shape[0]
-    nu = u0.shape[0]
-    k1 = work[0, :nx]
-    k2 = work[1, :nx]
-    k3 = work[2, :nx]
-    k4 = work[3, :nx]
-    probe = work[4, :nx]
-    u = work[5, :nu]
-    delta = dt / substeps
+    nx, nu, delta = x.shape[0], u0.shape[0], dt / substeps
+    probe, u = work[4, :nx], work[5, :nu]
     for step in range(substeps):
-        _read_input(u0, u1, c0, c1, dt, step / substeps, u)
-        derivative(x, u, p, w, k1)
-        _read_input(u0, u1, c0, c1, dt, (step + 0.5) / substeps, u)
+        for stage in range(4):
+            ahead = 0.5 * ((stage + 1) // 2)
+            share = (step + ahead) / substeps
+            rest = 1.0 - share
+            before, after = rest * (rest * rest - 1.0), share * (share * share - 1.0)
+            for i in range(nu):
+                bend = dt * dt / 6.0 * (c0[i] * before + c1[i] * after)
+                u[i] = u0[i] + (u1[i] - u0[i]) * share + bend
+            for i in range(nx):
+                probe[i] = x[i] + ahead * delta * work[stage - 1, i] if stage > 0 else x[i]
+            derivative(probe, u, p, w, work[stage, :nx])
         for i in range(nx):
-            probe[i] = x[i] + 0.5 * delta * k1[i]
-        derivative(probe, u, p, w, k2)
-        for i in range(nx):
-            probe[i] = x[i] + 0.5 * delta * k2[i]
-        derivative(probe, u, p, w, k3)
-        _read_input(u0, u1, c0, c1, dt, (step + 1.0) / substeps, u)
-        for i in range(nx):
-            probe[i] = x[i] + delta * k3[i]
-        derivative(probe, u, p, w, k4)
-        for i in range(nx):
-            x[i] += delta / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
+            total = work[0, i] + 2.0 * work[1, i] + 2.0 * work[2, i] + work[3, i]
+            x[i] += delta / 6.0 * total

@@ -18,7 +18,6 @@ from bampipe.arrays import Array, Indices
 from bampipe.compiled import njit, part, record_type
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
-from bampipe.estimate.triangular import cholesky, forward_substitute
 from bampipe.model_functions import DERIVATIVE
 
 _V = float64[::1]
@@ -148,7 +147,7 @@ def _solve_goal(derivative, x, u, plant, arm, k, out):  # type: ignore[no-untype
     frequency, damping = arm.natural_frequency, arm.damping_ratio
     nx, n, nf = x.shape[0], plant.width.shape[0], force.shape[0]
     still, moved, response = np.empty(nx), np.empty(nx), np.empty((n, nf))
-    normal, factor = np.empty((nf, nf)), np.zeros((nf, nf))
+    normal = np.empty((nf, nf))
     derivative(x, u, p, w, still)
     for j in range(nf):
         u[force[j]] += 1.0
@@ -170,17 +169,14 @@ def _solve_goal(derivative, x, u, plant, arm, k, out):  # type: ignore[no-untype
         error += 2.0 * damping * frequency * (arm.qd_ref[k, i] - x[at[i, 1]])
         for j in range(nf):
             out[j] += response[i, j] * error
-    for j in range(nf):  # keeps the solution finite where a force moves nothing
-        normal[j, j] += 1e-12 * trace + 1e-300
-    if not (np.isfinite(trace) and cholesky(normal, factor)):
-        for j in range(nf):  # the motion has diverged: the caller reports it
-            out[j] = np.nan
-        return
-    forward_substitute(factor, nf, out)
-    for j in range(nf - 1, -1, -1):
-        for i in range(j + 1, nf):
-            out[j] -= factor[i, j] * out[i]
-        out[j] /= factor[j, j]
+    size = trace
+    for j in range(nf):
+        size += abs(out[j])
+        normal[j, j] += 1e-12 * trace + 1e-300  # finite where a force moves nothing
+    if np.isfinite(size):  # else the motion has diverged: the caller reports it
+        solved = np.linalg.solve(normal, out)
+        for j in range(nf):
+            out[j] = solved[j]
 
 
 @njit(void(DERIVATIVE, _M, _M, PLANT, _ARM, _I, _M, float64))

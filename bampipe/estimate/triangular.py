@@ -1,4 +1,4 @@
-"""Triangular factors of covariances, compiled: Cholesky, QR, rotations, substitution.
+"""Triangular factors of covariances, compiled: QR, rotations, substitution.
 
 All matrices are float64 and C-contiguous. The loops replace LAPACK because at 13 x 13 the call
 and its allocations cost more than the arithmetic.
@@ -20,32 +20,6 @@ def padded(n):  # type: ignore[no-untyped-def]
     remainder.
     """
     return (n + _LANES - 1) // _LANES * _LANES
-
-
-@part(fastmath=_REASSOCIATE)
-def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
-    """Write the lower Cholesky factor of ``covariance`` (n, n) into ``factor`` (n, n).
-
-    Returns:
-        Whether the matrix is positive definite; ``factor`` is meaningless otherwise.
-    """
-    n = covariance.shape[0]
-    for j in range(n):
-        for k in range(j):
-            factor[k, j] = 0.0
-        pivot = covariance[j, j]
-        for k in range(j):
-            pivot -= factor[j, k] * factor[j, k]
-        if not pivot > 0.0:
-            return False
-        diagonal = pivot**0.5
-        factor[j, j] = diagonal
-        for i in range(j + 1, n):
-            total = covariance[i, j]
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            factor[i, j] = total / diagonal
-    return True
 
 
 @part(fastmath=_REASSOCIATE)

@@ -110,9 +110,7 @@ class FilterModel:
 
     def place_parameters(self, theta: Array, p: Array) -> None:
         """Write estimated parameters ``theta`` (nt,), clamped to their range, into all ``p``."""
-        value = np.minimum(np.maximum(theta, self.range[0]), self.range[1])
-        value[self.logarithmic] = np.exp(value[self.logarithmic])
-        p[self.free] = value
+        p[self.free] = self.to_physical(np.clip(theta, *self.range))[0]
 
     def to_physical(self, mean: Array) -> tuple[Array, Array]:
         """Return the physical parameters for ``mean`` (..., nt), and their derivatives by it."""

@@ -128,7 +128,7 @@ class Monitor:
     def _start_filter(self, start: Start) -> None:
         self.start = start
         self._test = WindowTest(len(self.system.coordinates), start.window)
-        self._threshold = start.reference.threshold(self.options.probability)
+        self._threshold = start.threshold
 
     def _filter_samples(self, t: Array, u: Array, q: Array) -> None:
         """Filter samples in stretches; a gap between them restarts the motion."""

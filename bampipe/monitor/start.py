@@ -13,7 +13,7 @@ from bampipe.data.session import Session, read_session
 from bampipe.data.stream import SampleStream, StreamLayout
 from bampipe.declarations.model_file import load_model, read_estimate
 from bampipe.errors import InputError
-from bampipe.estimate.consistency import Reference, window_means
+from bampipe.estimate.consistency import find_threshold, window_means
 from bampipe.estimate.square_root import FilterSettings
 from bampipe.estimate.unscented import FilterFailure, FilterModel, Trial, filter_trials
 from bampipe.files import cannot
@@ -77,7 +77,7 @@ class Start:
         model, settings: of the filter.
         theta, covariance: (nt,) and (nt, nt) parameters, on the scale of estimation.
         speed_sd: (n_q,) standard deviation of the rates at the first sample.
-        reference: distribution of the mean NIS over a window; window: its length in samples.
+        threshold: of the mean NIS over a window, for an alarm; window: its length in samples.
     """
 
     model: FilterModel
@@ -85,7 +85,7 @@ class Start:
     theta: Array
     covariance: Array
     speed_sd: Array
-    reference: Reference
+    threshold: float
     window: int
 
     def state(self, system: System, q: Array, u: Array) -> tuple[Array, Array]:
@@ -202,7 +202,7 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
     window = max(2, round(options.window_s * rate))
     start = Start(
         model, settings, theta, covariance, np.maximum(speed, 1e-3),
-        Reference.of_theory(window * n), window,
+        find_threshold(options.probability, window * n), window,
     )  # fmt: skip
     means = []
     for trial in trials:
@@ -216,7 +216,8 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
                 remedy=f"bampipe diagnose {run.root}{run.model_option(name)}",
             ) from failure
         means.append(window_means(filtered.nis[window:], n, window))
-    return system, replace(start, reference=Reference.of_windows(np.concatenate(means), window * n))
+    threshold = find_threshold(options.probability, window * n, np.concatenate(means))
+    return system, replace(start, threshold=threshold)
 
 
 def start_from_samples(
@@ -257,7 +258,7 @@ def start_from_samples(
     )
     return Start(
         model, settings, theta, np.diag(spread**2), np.ones(n),
-        Reference.of_theory(window * n), window,
+        find_threshold(options.probability, window * n), window,
     )  # fmt: skip
 
 

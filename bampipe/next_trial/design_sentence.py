@@ -14,6 +14,8 @@ _REPEATED_FROM = 1.2
 """A design longer than this times the imitated trial repeats it."""
 _SLOW_BELOW, _FAST_FROM = 0.12, 0.45
 """Shares of the highest speed in the trials below and above which motion is called slow or fast."""
+_SHOWN = {"rad": (math.degrees(1.0), "°"), "m": (1e3, " mm")}
+"""By unit, the factor and the unit in which people read it."""
 _LONG_STROKE_S = 2.0
 """A stroke that takes this long is not called fast."""
 
@@ -79,7 +81,7 @@ def _say_example(design: Primitive, example: Example, device: Device) -> str:
     names = [f"{axes[i].name} " if len(moving) > 1 else "" for i in moving]
     each = ", ".join(
         f"{name}{_say_ends(Stroke(low[i], high[i], 0.0, 0.0), axes[i].unit)}"
-        f" at up to {_format_speed(speed[i], axes[i].unit)}"
+        f" at up to {rounded(_SHOWN[axes[i].unit][0] * speed[i])}{_SHOWN[axes[i].unit][1]}/s"
         for i, name in zip(moving, names, strict=True)
     )
     length_s = float(example.motion.t[-1] - example.motion.t[0])
@@ -88,12 +90,6 @@ def _say_example(design: Primitive, example: Example, device: Device) -> str:
         f"Move {join_names(axes[i].name for i in moving)} as in trial {example.trial}, {each},"
         f"{again} for {design.seconds:.3g} s"
     )
-
-
-def _format_speed(value: float, unit: str) -> str:
-    if unit == "rad":
-        return f"{rounded(math.degrees(value))}°/s"
-    return f"{rounded(1e3 * value)} mm/s"
 
 
 def _say_beyond(design: Primitive, seen: Envelope, axes: Sequence[Coordinate]) -> str:
@@ -111,11 +107,9 @@ def _say_beyond(design: Primitive, seen: Envelope, axes: Sequence[Coordinate]) -
 
 def _say_gentle(stroke: Stroke, unit: str) -> str:
     """Return centre, half travel and time of the gentle strokes of an axis."""
+    factor, symbol = _SHOWN[unit]
     middle, half = 0.5 * (stroke.low + stroke.high), 0.5 * (stroke.high - stroke.low)
-    if unit == "rad":
-        text = f"{_round(math.degrees(middle), 0)}° ± {_round(math.degrees(half), 0)}°"
-    else:
-        text = f"{_round(1e3 * middle, 0)} ± {_round(1e3 * half, 0)} mm"
+    text = f"{_round(factor * middle, 0)}{symbol} ± {_round(factor * half, 0)}{symbol}"
     return f"{text} in {rounded(stroke.typical_s)} s each way".replace("-", "−")
 
 

@@ -129,12 +129,6 @@ class Envelope:
         return replace(self, wider=wider)
 
     @property
-    def reach(self) -> tuple[Array, Array]:
-        """Lowest and highest positions of all designs, each (n_q,)."""
-        farthest = self.wider or self
-        return farthest.low, farthest.high
-
-    @property
     def moved_axes(self) -> list[int]:
         """Axes that the trials have moved."""
         return [i for i in range(len(self.low)) if self.high[i] > self.low[i] and self.speed[i] > 0]

@@ -126,7 +126,7 @@ def follow_roughly(
         haste = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED_SPREAD, _SPEED_SPREAD)
         reach = 0.5 if hastily else 1.0 - rng.uniform(0.0, _RANGE_SPREAD)
         return replace(design, example=replace(design.example, reach=reach, haste=haste))
-    strokes, (lowest, highest) = {}, seen.reach
+    strokes, farthest = {}, seen.wider or seen
     for axis, stroke in design.strokes.items():
         speed = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED_SPREAD, _SPEED_SPREAD)
         share = 0.5 if hastily else 1.0 + rng.uniform(-_RANGE_SPREAD, _RANGE_SPREAD)
@@ -135,8 +135,8 @@ def follow_roughly(
         middle = 0.5 * (stroke.low + stroke.high) + rng.uniform(-room, room)
         strokes[axis] = replace(
             stroke,
-            low=max(middle - 0.5 * width, float(lowest[axis])),
-            high=min(middle + 0.5 * width, float(highest[axis])),
+            low=max(middle - 0.5 * width, float(farthest.low[axis])),
+            high=min(middle + 0.5 * width, float(farthest.high[axis])),
             slow=speed * stroke.slow,
             fast=speed * stroke.fast,
         )

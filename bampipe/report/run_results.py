@@ -14,7 +14,7 @@ from bampipe.declarations.model import read_model_file
 from bampipe.errors import MissingResultError
 from bampipe.files import read_toml
 from bampipe.lists import join_names
-from bampipe.results.compare import CompareResult
+from bampipe.results.compare import CompareResult, Rung
 from bampipe.results.ingest import IngestResult
 from bampipe.results.record import Result
 from bampipe.results.run import RunResult
@@ -118,12 +118,16 @@ class Results:
         return "torque" if self.is_rotary(axis) else "force"
 
     @cached_property
+    def ladder(self) -> tuple[Rung, ...]:
+        """The compared model versions, parents before children; none before they are compared."""
+        compared = self.read(CompareResult)
+        return compared.ladder if compared else ()
+
+    @cached_property
     def models(self) -> tuple[str, ...]:
         """The models: in the order of the ladder, then all others, parents before children."""
         found = RunFolder(self.root).models("identify.json")
-        compared = self.read(CompareResult)
-        ladder = [rung.model for rung in compared.ladder] if compared else []
-        ranked = [name for name in ladder if name in found]
+        ranked = [rung.model for rung in self.ladder if rung.model in found]
         return (*ranked, *(name for name in found if name not in ranked))
 
     @cached_property

@@ -19,7 +19,9 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from bampipe.report import document
 from bampipe.report.wording import break_lines, choose_scale, format_unit, split_name
+from bampipe.results.draft import DraftCurve
 from bampipe.results.rounding import NORMAL_95
+from bampipe.results.terms import TermCurve
 
 COLOURS = {
     "ink": "#1c2024", "faint": "#b4b8bd", "blue": "#0072b2", "vermillion": "#d55e00",
@@ -157,20 +159,20 @@ def thin(length: int, most: int) -> slice:
 
 
 def draw_curve(
-    axes: Axes, band: tuple[Sequence[float], ...], variable: str, unit: str, **look: Any
+    axes: Axes, curve: TermCurve | DraftCurve, at: Sequence[float], word: str = "", **look: Any
 ) -> None:
     """Draw a force with its band over a variable.
 
     Args:
-        band: the variable, and the mean, lower and upper end of the force there.
-        variable: its name, in files; unit: its unit; look: of the line.
+        at: values of the variable; word: behind the name of the force; look: of the line.
     """
-    at, mean, low, high = band
-    x, shown = scale_values(np.array(at), unit)
-    axes.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0)
-    axes.plot(x, mean, color=BLUE, **look)
+    x, shown = scale_values(np.array(at), curve.variable_unit)
+    axes.fill_between(x, curve.low, curve.high, color=BLUE, alpha=0.25, lw=0)
+    axes.plot(x, curve.mean, color=BLUE, **look)
     axes.axhline(0.0, color=INK, lw=0.5)
-    axes.set_xlabel(label_axis(split_name(variable), shown))
+    kind = "torque" if curve.unit.startswith("N.m") else "force"
+    axes.set_xlabel(label_axis(split_name(curve.variable), shown))
+    axes.set_ylabel(label_axis(f"{kind}{word}", curve.unit))
 
 
 def draw_series(

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from bampipe.results import rounding
+from bampipe.results.rounding import find_digits, significant
 
 _POWERS = {"2": "²", "3": "³"}
 _PREFIXES = ((1e-6, 1e-7, "µ"), (1e-3, 1e-4, "m"), (1.0, 0.1, ""), (1e3, 1e3, "k"), (1e6, 1e6, "M"))
@@ -73,7 +73,7 @@ def format_digits(value: float | None, digits: int = 3) -> str:
     """Return ``value`` with so many significant digits."""
     if value is None or not math.isfinite(value):
         return NONE
-    return format_prose(rounding.significant(value, digits))
+    return format_prose(significant(value, digits))
 
 
 def format_stated(value: float) -> str:
@@ -105,12 +105,6 @@ def format_interval(low: float, high: float, sd: float | None) -> str:
 def _join_numbers(word: str, first: float, second: float, decimals: int, power: int) -> str:
     shown = word.join(format_decimals(x / 10.0**power, decimals) for x in (first, second))
     return f"({shown}){_format_power(power)}" if power else shown
-
-
-def find_digits(value: float, sd: float | None) -> tuple[int, int]:
-    """Return the decimals that ``sd`` leaves ``value``, and the power of ten to take out first."""
-    power = rounding.power_for(value, sd)
-    return rounding.decimals_for(sd / 10.0**power if sd else sd, value / 10.0**power), power
 
 
 def format_percent(share: float | None) -> str:

@@ -1,7 +1,6 @@
 """``compare.json``: the ladder of model versions on the same held-out trials."""
 
 import math
-from collections.abc import Iterable
 from typing import Literal, Self
 
 from pydantic import Field
@@ -35,11 +34,6 @@ class Rung(Record):
     free_run: dict[str, FreeRunError] = Field(default={}, description="By axis")
     drift: dict[str, AxisDrift] = Field(default={}, description="By axis: short free runs")
 
-    def median_drift(self, axis: str) -> dict[float, float]:
-        """Return the median drift of one axis, rad or m, by horizon in s."""
-        found = self.drift.get(axis)
-        return {h.horizon_s: h.median for h in found.horizons} if found else {}
-
     def improves_on(self, other: Self) -> bool:
         """Return whether its held-out error is lower and can still be judged.
 
@@ -65,12 +59,6 @@ class Rung(Record):
     def _floor_is_wrong(self, axis: str) -> bool:
         error, floor = self.held_out_rmse.get(axis, math.nan), self.noise_floor.get(axis)
         return compare_with_floor(error, floor) in FLOOR_WRONG
-
-
-def horizons_of(rungs: Iterable[Rung]) -> list[float]:
-    """Every horizon, s, at which the drift of some version is known; shortest first."""
-    drifts = (found for rung in rungs for found in rung.drift.values())
-    return sorted({h.horizon_s for found in drifts for h in found.horizons})
 
 
 class Value(Record):

@@ -9,7 +9,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent import futures
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
@@ -53,7 +53,7 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
             client.submit(guarded, _place(request), ignore_event, pure=False): number
             for number, request in enumerate(requests)
         }
-        watch = _Watch(client)
+        watch = _watch(client)
         while tasks and not lost:
             for task in [task for task in tasks if task.done()]:
                 number = tasks.pop(task)
@@ -67,7 +67,7 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
                     text = f"its worker failed: {type(error).__name__}: {error}"
                     outcomes[number] = Outcome(root, "crashed", error=text)
                 listen(Event(root.name, "", "done", 1.0))
-            lost = lost or watch.fault()
+            lost = lost or next(watch)
             time.sleep(0.0 if lost or not tasks else 0.05)
     finally:
         with contextlib.suppress(Exception):
@@ -119,28 +119,21 @@ def _within(seconds: float, call: Callable[[], Answer]) -> Answer:
     return answer.result(timeout=seconds)
 
 
-class _Watch:
-    """Checks periodically that the scheduler answers and has workers."""
-
-    def __init__(self, client: "Client") -> None:
-        self._client = client
-        self._asked = self._manned = time.monotonic()
-
-    def fault(self) -> str:
-        """Return the fault of the cluster; "" if there is none."""
-        now = time.monotonic()
-        if now - self._asked < POLL_S:
-            return ""
-        self._asked = now
-        try:
-            found = _within(PATIENCE_S, lambda: self._client.scheduler_info()["workers"])
-        except Exception:
-            return "the Dask scheduler was lost"
-        if found:
-            self._manned = now
-        if now - self._manned > PATIENCE_S:
-            return f"the Dask scheduler has had no workers for {PATIENCE_S:g} s"
-        return ""
+def _watch(client: "Client") -> Iterator[str]:
+    """Yield, each time that it is asked, the fault of the cluster; "" if there is none."""
+    asked = manned = time.monotonic()
+    while True:
+        now, fault = time.monotonic(), ""
+        if now - asked >= POLL_S:
+            asked = now
+            try:
+                if _within(PATIENCE_S, lambda: client.scheduler_info()["workers"]):
+                    manned = now
+            except Exception:
+                fault = "the Dask scheduler was lost"
+            if not fault and now - manned > PATIENCE_S:
+                fault = f"the Dask scheduler has had no workers for {PATIENCE_S:g} s"
+        yield fault
 
 
 def _place(request: Request) -> Request:

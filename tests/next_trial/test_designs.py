@@ -194,12 +194,12 @@ def test_who_follows_roughly_stays_within_the_device_too():
     system = SimpleNamespace(coordinates=("a", "b", "c"))
     seen = TIMID.widen(LIMITS, np.full(3, np.nan))
     rehearsal = Rehearsal(system, np.zeros(0), None, None, seen, 0)
-    lowest, highest = seen.reach
     for design in list_primitives(seen, 20.0, [0], with_rests=False)[-8:]:
         for version in range(1, 9):
             followed = follow_roughly(design, rehearsal.seen, np.random.default_rng(version), False)
             for axis, stroke in followed.strokes.items():
-                assert lowest[axis] <= stroke.low < stroke.high <= highest[axis]
+                low, high = seen.wider.low[axis], seen.wider.high[axis]
+                assert low <= stroke.low < stroke.high <= high
 
 
 def test_a_hand_moves_no_faster_than_hands_do():

@@ -14,7 +14,6 @@ from bampipe.report.document import strip_marks
 from bampipe.report.explorer.packing import Packer
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_unit, name_trial_state, split_name
-from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.record import Result
@@ -237,8 +236,7 @@ def _describe_model(session: _Session, name: str) -> Content:
     """Return what the page shows of a model: of its records, the fields that the scripts read."""
     results = session.results
     number = results.models.index(name)
-    compared = results.read(CompareResult)
-    added = [rung.added for rung in (compared.ladder if compared else ()) if rung.model == name]
+    added = [rung.added for rung in results.ladder if rung.model == name]
     described: Content = {
         "name": session.prefix + name,
         "label": session.prefix + (f"version {number}" if number else name),

@@ -12,7 +12,6 @@ from bampipe.report.document import Block, Callout, Figure, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.sections import next_trial
 from bampipe.report.wording import format_decimals, format_digits, format_unit, split_name
-from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, RankedEffect, ResidualMap
 from bampipe.results.draft import DraftResult
 from bampipe.results.next import NextResult
@@ -94,8 +93,8 @@ def _tell_sensitivity(results: Results, model: str) -> str:
 
 def _advise(results: Results, found: DiagnoseResult) -> str:
     """Return the next command, or its result if it has been run."""
-    compared, wanted = results.read(CompareResult), {*found.selected}
-    for rung in compared.ladder if compared else ():
+    wanted = {*found.selected}
+    for rung in results.ladder:
         if wanted and rung.parent == found.model and wanted == {*(rung.added or "").split(", ")}:
             return f"Added since, as model `{rung.model}`."
     if found.next.startswith("bampipe draft ") and results.read(DraftResult, found.model):

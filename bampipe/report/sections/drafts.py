@@ -66,11 +66,8 @@ def _draw(
             low, high, mean = (-np.array(v) for v in (residual.high, residual.low, residual.mean))
             panel.fill_between(centre, low, high, color=style.VERMILLION, alpha=0.2, lw=0)
             panel.plot(centre, mean, ".-", color=style.VERMILLION, ms=3.0, lw=0.8, label="residual")
-        band = (curve.at, curve.mean, curve.low, curve.high)
-        style.draw_curve(panel, band, curve.variable, curve.variable_unit, label="draft")
+        style.draw_curve(panel, curve, curve.at, label="draft")
         panel.set_title(split_name(effect_name.partition(":")[0]), fontsize="small")
-        kind = "torque" if curve.unit.startswith("N.m") else "force"
-        panel.set_ylabel(style.label_axis(kind, curve.unit))
     panel = panels[-2]
     counts = [option.constants for option in entry.options]
     errors = [option.held_out_rmse for option in entry.options]

@@ -12,7 +12,6 @@ from bampipe.report import style
 from bampipe.report.document import Block, Figure, Formulas, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_quantity, format_unit, split_name
-from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult, WorstWindow
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.terms import ModelTerm, TermCurve, TermsResult
@@ -78,10 +77,8 @@ def _draw_curves(name: str, curves: Sequence[TermCurve], caption: str) -> Figure
 
 
 def _draw_curve(panel: Axes, curve: TermCurve) -> None:
-    band = (curve.center, curve.mean, curve.low, curve.high)
-    style.draw_curve(panel, band, curve.variable, curve.variable_unit, marker=".", ms=3.0)
-    kind = "torque" if curve.unit.startswith("N.m") else "force"
-    panel.set(title=curve.axis, ylabel=style.label_axis(f"{kind} taken", curve.unit))
+    style.draw_curve(panel, curve, curve.center, " taken", marker=".", ms=3.0)
+    panel.set_title(curve.axis)
 
 
 def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator[Block]:
@@ -138,9 +135,8 @@ def _find_window(
 
     With it, the effects that were added, and the residuals without and with them.
     """
-    compared = results.read(CompareResult)
-    rungs = compared.ladder if compared else ()
-    rung = next((one for one in rungs if term.name in (one.added or "").split(", ")), None)
+    adding = (one for one in results.ladder if term.name in (one.added or "").split(", "))
+    rung = next(adding, None)
     diagnosis = results.read(DiagnoseResult, rung.parent) if rung and rung.parent else None
     if rung is None or rung.parent is None or diagnosis is None:
         return None

@@ -13,7 +13,6 @@ from bampipe.report import style
 from bampipe.report.document import Block, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
-    find_digits,
     format_decimals,
     format_digits,
     format_interval,
@@ -23,7 +22,7 @@ from bampipe.report.wording import (
     name_parameter,
 )
 from bampipe.results.identify import IdentifyResult, ParameterEstimate
-from bampipe.results.rounding import NORMAL_95
+from bampipe.results.rounding import NORMAL_95, find_digits
 from bampipe.results.validate import ValidateResult
 
 TITLE = "Identification"

@@ -16,7 +16,7 @@ from bampipe.report.wording import (
     format_unit,
     split_name,
 )
-from bampipe.results.compare import CompareResult, Rung, Value, horizons_of
+from bampipe.results.compare import CompareResult, Rung, Value
 
 TITLE = "Model versions"
 _MOST_COLUMNS = 3
@@ -52,8 +52,13 @@ def tabulate_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Iterator[Table]
     """Yield the errors of each version in free runs: whole trials, and short horizons."""
     if any(rung.free_run for rung in rungs):
         yield _tabulate_free_runs(rungs, axes)
-    if horizons_of(rungs):
-        yield _tabulate_drift(rungs, axes)
+    every = {axis: [rung.drift.get(axis) for rung in rungs] for axis in axes}
+    drifts = {
+        axis: [{h.horizon_s: h.median for h in one.horizons} if one else {} for one in found]
+        for axis, found in every.items()
+    }
+    if any(map(any, drifts.values())):
+        yield _tabulate_drift(rungs, drifts)
 
 
 def _choose_scales(
@@ -90,10 +95,11 @@ def _tabulate_free_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
     return Table(caption, " | ".join(("Version | Loop", *heads)), rows, " ".join(reasons))
 
 
-def _tabulate_drift(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
-    """Tabulate the median drift of each version within each horizon."""
-    horizons = horizons_of(rungs)
-    drifts = {axis: [rung.median_drift(axis) for rung in rungs] for axis in axes}
+def _tabulate_drift(
+    rungs: Sequence[Rung], drifts: Mapping[str, Sequence[Mapping[float, float]]]
+) -> Table:
+    """Tabulate ``drifts``, by axis and version the median drift within each horizon, s."""
+    horizons = sorted({h for found in drifts.values() for one in found for h in one})
     scales = _choose_scales(
         {axis: [x for one in found for x in one.values()] for axis, found in drifts.items()},
         {axis: one.unit for found in rungs for axis, one in found.drift.items()},

@@ -1,6 +1,6 @@
 """Summary: the verdict, the trials and the model, the key numbers."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from bampipe.lists import count_noun, join_names
@@ -17,7 +17,7 @@ from bampipe.report.wording import (
     format_unit,
     name_parameter,
 )
-from bampipe.results.compare import CompareResult
+from bampipe.results.compare import Rung
 from bampipe.results.identify import IdentifyResult, ParameterEstimate
 from bampipe.results.rounding import NORMAL_95
 from bampipe.results.setup import SetupResult
@@ -93,14 +93,13 @@ def _describe_session(results: Results) -> str:
 
 
 def _describe_ladder(results: Results) -> str:
-    compared = results.read(CompareResult)
-    if compared is None or len(compared.ladder) < 2:
+    if len(results.ladder) < 2:
         return ""
-    first = compared.ladder[0]
-    number = [rung.model for rung in compared.ladder].index(results.model)
+    first = results.ladder[0]
+    number = [rung.model for rung in results.ladder].index(results.model)
     if number == 0:
-        return _explain_rejection(compared)
-    last, changes = compared.ladder[number], []
+        return _explain_rejection(results.ladder)
+    last, changes = results.ladder[number], []
     for axis, before in results.order_axes(first.held_out_rmse).items():
         after, floor = last.held_out_rmse.get(axis), last.noise_floor.get(axis)
         if after is not None:
@@ -113,12 +112,12 @@ def _describe_ladder(results: Results) -> str:
     )
 
 
-def _explain_rejection(compared: CompareResult) -> str:
+def _explain_rejection(rungs: Sequence[Rung]) -> str:
     """Say why no later version is accepted, although one may have a lower error."""
-    first = compared.ladder[0]
-    better = [rung for rung in compared.ladder if rung.has_lower_error_than(first)]
+    first = rungs[0]
+    better = [rung for rung in rungs if rung.has_lower_error_than(first)]
     if not better:
-        return f"Of {len(compared.ladder)} models none has a lower error than `{first.model}`."
+        return f"Of {len(rungs)} models none has a lower error than `{first.model}`."
     why = "the version it builds on is not confirmed"
     if better[-1].has_lost_its_floor(first):
         why = "it has no noise floor, or an error far below it, which cannot be judged"
