@@ -1,18 +1,57 @@
-"""Zero-phase low-pass of many columns, evaluated at few samples."""
+"""Zero-phase low-pass of many columns, evaluated at few samples: the inner loop of comparisons."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
+from numba import float64, int64
+from scipy.signal import butter, sosfilt_zi
 
 from bampipe.arrays import Array, Indices
+from bampipe.compiled import njit
+
+_V = float64[::1]
+_M = float64[:, ::1]
+
+
+_TOGETHER = 4
+"""Columns that go through the filter at once: each waits for its own last sample, so that several
+side by side take hardly longer than one."""
+
+
+@njit(_M(_M, _V, _V, int64[::1]))
+def _run(values, section, start, kept):  # type: ignore[no-untyped-def]
+    count, columns = values.shape
+    y, out = np.zeros((count, _TOGETHER)), np.empty((len(kept), columns))
+    b0, b1, b2, a1, a2 = section[0], section[1], section[2], section[4], section[5]
+    s0, s1 = np.empty(_TOGETHER), np.empty(_TOGETHER)
+    for first in range(0, columns, _TOGETHER):
+        width = min(_TOGETHER, columns - first)
+        for i in range(count):
+            for j in range(width):
+                y[i, j] = values[i, first + j]
+        for last, step in ((count - 1, 1), (0, -1)):
+            first_row = count - 1 - last
+            for j in range(_TOGETHER):
+                s0[j], s1[j] = start[0] * y[first_row, j], start[1] * y[first_row, j]
+            for i in range(first_row, last + step, step):
+                for j in range(_TOGETHER):
+                    x = y[i, j]
+                    v = b0 * x + s0[j]
+                    s0[j] = b1 * x - a1 * v + s1[j]
+                    s1[j] = b2 * x - a2 * v
+                    y[i, j] = v
+        for i in range(len(kept)):
+            for j in range(width):
+                out[i, first + j] = y[kept[i], j]
+    return out
 
 
 @lru_cache(maxsize=64)
-def _design(cutoff_hz: float, rate_hz: float) -> Array:
-    return np.asarray(butter(2, cutoff_hz, fs=rate_hz, output="sos"))
+def _design(cutoff_hz: float, rate_hz: float) -> tuple[Array, Array]:
+    section = np.asarray(butter(2, cutoff_hz, fs=rate_hz, output="sos"))
+    return section[0].copy(), np.asarray(sosfilt_zi(section))[0].copy()
 
 
 def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: Indices | slice) -> Array:
@@ -25,8 +64,8 @@ def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: Indices |
     Raises:
         ValueError: the cut-off is not between 0 and half the sampling rate.
     """
-    section = _design(cutoff_hz, rate_hz)
-    return np.asarray(sosfiltfilt(section, values, axis=0, padtype=None)[kept])
+    section, start = _design(cutoff_hz, rate_hz)
+    return np.asarray(_run(np.ascontiguousarray(values), section, start, kept))
 
 
 @dataclass(frozen=True)
