@@ -54,8 +54,8 @@ def _design(cutoff_hz: float, rate_hz: float) -> tuple[Array, Array]:
     return section[0].copy(), np.asarray(sosfilt_zi(section))[0].copy()
 
 
-def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: Indices | slice) -> Array:
-    """Low-pass columns (T, ...) forwards and backwards; return the rows ``kept``, (K, ...).
+def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: Indices) -> Array:
+    """Low-pass columns (T, k) forwards and backwards; return the rows ``kept``, (K, k).
 
     It is a second-order Butterworth filter in each direction, with ``cutoff_hz`` the half-power
     frequency of one pass, started in the steady state of the first (last) sample. The caller keeps
@@ -126,8 +126,11 @@ class Band:
         kept, cutoffs = self.thinned_rows(len(values)), np.array(self.cutoff_hz)
         which = np.arange(values.shape[1]) % cutoffs.size if axes is None else np.asarray(axes)
         by_column = cutoffs[which]
+        distinct = np.unique(by_column)
+        if distinct.size == 1:
+            return low_pass_at(values, float(distinct[0]), self.rate_hz, kept)
         out = np.empty((len(kept), values.shape[1]))
-        for cutoff in np.unique(by_column):
+        for cutoff in distinct:
             chosen = by_column == cutoff
             out[:, chosen] = low_pass_at(values[:, chosen], float(cutoff), self.rate_hz, kept)
         return out
