@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bampipe.data.quality.channels import part_readings
 from bampipe.data.session import read_session, session_from
-from bampipe.data.stream import SampleStream, StreamLayout
+from bampipe.data.session.conversion import Conversion
+from bampipe.data.stream import SampleStream, conversion_of_stream
 from bampipe.errors import InputError
 
 SAMPLES = Path(__file__).parents[2] / "sample_runs"
-SI = StreamLayout.in_si(["q_yaw", "force_x"])
+SI = Conversion.in_si(["q_yaw", "force_x"])
 
 
 class Pipe:
@@ -106,7 +106,7 @@ def test_what_is_no_log_is_refused_and_complaints_are_few():
 
 
 def test_raw_columns_of_a_session_become_si():
-    layout = StreamLayout.of_session(read_session(SAMPLES / "first"))
+    layout = conversion_of_stream(read_session(SAMPLES / "first"))
     pipe = Pipe((SI, layout))
     rows = pipe.write(
         "time_us,enc_yaw,enc_pitch,enc_extension,brake_yaw,brake_pitch,brake_extension,"
@@ -131,9 +131,6 @@ def test_motors_that_several_joints_turn_give_the_positions_of_these():
         },
     }  # fmt: skip
     session = session_from(table, Path())
-    rows = Pipe((StreamLayout.of_session(session),)).write("t,a,b\n0,0.1,1.4\n1,0.2,\n2,,1.5\n")
+    rows = Pipe((conversion_of_stream(session),)).write("t,a,b\n0,0.1,1.4\n1,0.2,\n2,,1.5\n")
     np.testing.assert_allclose(rows[:, 1], [0.1, 0.2, np.nan])
     np.testing.assert_allclose(rows[:, 2], [0.2, np.nan, np.nan], atol=1e-12)
-    si = {"q_one": np.array([0.1, 0.2]), "q_two": np.array([0.4, 0.7])}
-    part_readings(session, si)
-    np.testing.assert_allclose(si["q_two"], [0.2, 0.3])
