@@ -81,6 +81,7 @@ def test_units_of_properties_are_heard(tmp_path: Path):
             {"Name": "", "t": "0.01 s", "q": "0.1 Nm, if not applied"},
         ),
         (below, {"mSec": "", "TORQUE": "FT-LBS", "A (B)": "DEG"}),
+        (lines("{q:.4f},{u:.4f}", "x,y\nmrad,mrad\n"), {"x": "mrad", "y": "mrad"}),
         (lines("{t:.3f},{q:.4f}", "t [s],q (6064h)\n"), {"t [s]": "s", "q (6064h)": ""}),
         (lines("{t:.3f};{q:.4f}", "t / s;φ / X\n"), {"t / s": "s", "φ / X": ""}),
     ):
