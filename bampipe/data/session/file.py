@@ -28,7 +28,7 @@ from bampipe.data.session.channels import (
     TimeUnit,
 )
 from bampipe.errors import InputError, did_you_mean
-from bampipe.files import is_inside, read_toml
+from bampipe.files import is_inside, is_normal, read_toml
 from bampipe.schema import Declaration, NamedDeclaration, Positive, Several, Text, checked_by
 
 FILE_NAME = "session.toml"
@@ -45,14 +45,8 @@ def lexically_inside(path: str, where: str) -> None:
     Raises:
         InputError: the path is absolute, has "..", a drive, a backslash or a NUL character.
     """
-    remedy = "give a path relative to the session folder, with / between folders"
-    if PurePosixPath(path).is_absolute() or PureWindowsPath(path).drive:
-        raise InputError(f"absolute path '{path}'", where=where, remedy=remedy)
-    if ".." in PurePosixPath(path).parts or ".." in PureWindowsPath(path).parts:
-        raise InputError(f"path '{path}' leaves the session folder", where=where, remedy=remedy)
-    if "\\" in path or not path.isprintable():
-        shown = path.encode("unicode_escape").decode()
-        raise InputError(f"path '{shown}' is not portable", where=where, remedy=remedy)
+    if not is_normal(PurePosixPath(path).as_posix()) or PureWindowsPath(path).drive:
+        raise refusal("path_outside", where, path=path)
 
 
 def inside(root: Path, path: str, where: str) -> Path:
