@@ -10,12 +10,11 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.data.refusals import refusal
+from bampipe.data.robot_xml import DEEPEST
 from bampipe.errors import InputError
 
 _BELOW_ZERO = 1e-6
 """Share of the largest second moment of mass by which one may be below zero."""
-DEEPEST = 200
-"""Most links one behind another."""
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 """Kinds of joint that move a chain, and their names in a device file."""
 UPRIGHT = (0.0, 0.0, -9.81)

@@ -30,7 +30,7 @@ def conversion_of_stream(session: Session) -> Conversion:
     """
     where = str(session.root / "session.toml")
     clock = session.clock
-    if clock.datetime or clock.nanoseconds or not clock.column:
+    if clock.unit == "datetime" or clock.nanoseconds or not clock.column:
         raise refusal("stream_time", f"{where}: time")
     for rate in (encoder.name for encoder in session.encoders if encoder.integrate):
         raise refusal("stream_velocity", where, axis=rate)

@@ -13,15 +13,15 @@ import numpy as np
 from bampipe.data import readers
 from bampipe.data.guesses import MOST_IN_TURN, describe, find_roles, is_time, take_turns
 from bampipe.data.names import DRIVERS, FACTOR, REFERENCE_WORDS, role_of, unit_of, words
-from bampipe.data.parts import axes_of, join_parts
-from bampipe.data.readers import columns_of, extension_of, is_log, is_text, lerobot, read_trial
-from bampipe.data.readers.trial import Dialect, RawTrial
+from bampipe.data.parts import axes_of, join_parts, read_columns
+from bampipe.data.readers import columns_of, extension_of, is_log, is_text, lerobot
+from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.refusals import refusal
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS
 from bampipe.data.session.file import lexically_inside
-from bampipe.data.stated_rate import intervals_stated, units_stated
+from bampipe.data.stated_rate import SMALL, intervals_stated, units_stated
 from bampipe.data.units import RecordedUnit, spelled, unit
 from bampipe.data.vocabulary import VOCABULARY, by_word, word_set
 from bampipe.errors import InputError
@@ -32,8 +32,6 @@ _MOST_COLUMNS = 500
 """Of a table of samples, unless it has many rows."""
 _OTHER_DATA = by_word("unreadable")
 """What to do with files of data that are not read."""
-_SMALL = 1 << 16
-"""Bytes below which a text may be no log but a line of results."""
 _MOST_SCANNED = 1 << 30
 """Bytes of text in which other recordings are looked for; reading them takes some seconds."""
 _OTHER = "other columns, for another session"
@@ -221,9 +219,11 @@ class _Logs:
                 columns = columns_of(path, name=name, dialect=self.dialect)
                 if not columns:
                     raise InputError(f"no table: no column of numbers in it{_like(path)}")
-                small = path.stat().st_size < _SMALL and is_text(name)
+                small = path.stat().st_size < SMALL and is_text(name)
                 wide, first = len(columns) > _MOST_COLUMNS, next(iter(columns))
-                rows = len(self._read_one(name, columns, first)) if small or wide else 2
+                rows = 2
+                if small or wide:
+                    rows = len(read_columns(self.folder, name, columns, [first], self.dialect))
                 if wide and 0 < 10 * rows < len(columns):
                     raise refusal("wide", rows=rows, columns=len(columns))
                 if small and rows < 2:
@@ -242,12 +242,6 @@ class _Logs:
         for own in self.found.values():
             own |= {c: said[c][0] for c, u in own.items() if c in said and not u}
         self.remarks += [f"{c} is in {u}, as {file} says" for c, (u, file) in sorted(said.items())]
-
-    def _read_one(self, name: str, columns: Mapping[str, str], *wanted: str) -> RawTrial:
-        moments = {column: "" for column in wanted if columns[column] == "datetime"}
-        return read_trial(
-            self.folder / name, wanted, name=name, datetimes=moments, dialect=self.dialect
-        )
 
     def fault(self) -> InputError:
         """Error that no log can be read, with the reason of the first."""
@@ -449,14 +443,15 @@ class _Logs:
             return [trial]
         column = (times or sorted(columns, key=lambda name: "[:]." not in name))[0]
         moving = [c for c, u in columns.items() if role_of(c, u) == "position"] if times else []
-        raw = self._read_one(trial.file, columns, column, *moving)
+        wanted = [column, *moving]
+        raw = read_columns(self.folder, trial.file, columns, wanted, self.dialect)
         starts = starts_of(raw, column if times else "")
         if len(starts) == 1:
             return [trial]
-        wanted = {int(raw.rows[0]) - 1, *(int(raw.rows[at]) for at in starts)}
+        heads = {int(raw.rows[0]) - 1, *(int(raw.rows[at]) for at in starts)}
         with path.open(encoding="utf-8", errors="replace") as file:
             numbered = enumerate(file if is_text(trial.file) else (), 1)
-            lines = [re.split("[,;\t]", x.strip()) for n, x in numbered if n in wanted]
+            lines = [re.split("[,;\t]", x.strip()) for n, x in numbered if n in heads]
         for name, *axes in zip(*lines, strict=False):
             if {*words(name)} <= _AXES and words(name) and len({*axes}) > 1:
                 listed, place = join_names(dict.fromkeys(axes), 4), f"{trial.file}, column '{name}'"

@@ -100,17 +100,12 @@ class Clock(Declaration):
     fraction_unit: Literal["ns", "us", "ms"] = "ns"
     """Of that column, if it counts otherwise"""
 
-    @property
-    def datetime(self) -> bool:
-        """Whether it holds dates and times, which are read as s since the first."""
-        return self.unit == "datetime"
-
     def cross_faults(self) -> Iterator[InputError]:
         if self.unit == "samples" and self.column:
             yield refusal("clock_counts")
         if self.unit != "samples" and not self.column:
             yield refusal("clock_lacks")
-        if self.format and not self.datetime:
+        if self.format and self.unit != "datetime":
             yield InputError('only for unit = "datetime"', where="format")
         if (self.unit == "ticks") != (self.ticks_per_s is not None):
             yield refusal("clock_ticks")
