@@ -238,12 +238,12 @@ class _Samples:
     def passes_over(self, message: str, line: Line, layout: TableLayout) -> bool:
         """Whether a word stands where a number is expected: no reading, as "OVERLOAD" says."""
         cell = _CELL.search(message)
-        if not cell or not _NO_READING.fullmatch(cell[3]) or len(self.nothing) == _MOST_WORDS:
+        if not cell or not _NO_READING.fullmatch(cell[2]) or len(self.nothing) == _MOST_WORDS:
             return False
-        self.nothing.append(cell[3])
+        self.nothing.append(cell[2])
         column = layout.header[int(cell[1])]
         self.notes.append(
-            f"column '{column}' says '{cell[3]}' from row {line.number} on: taken as no reading"
+            f"column '{column}' says '{cell[2]}' from row {line.number} on: taken as no reading"
         )
         return True
 
@@ -378,8 +378,8 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
 _NO_READING = re.compile(r"[^\d\s\"\\][^\d\"\\]{0,19}|[-+]?1\.#\w+|#[A-Z]+[/\d!?]*")
 """Words for no reading, numbers of old C libraries among them."""
 _MOST_WORDS = 8
-_TORN = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", re.DOTALL)
-_CELL = re.compile(r"In CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", re.DOTALL)
+_ROW = re.compile(r"Row #(\d+): ")
+_CELL = re.compile(r"In CSV column #(\d+): .*invalid value '(.*)'", re.DOTALL)
 
 
 def _faulty_line(stream: BinaryIO, message: str, read: int, layout: TableLayout) -> Line:
@@ -387,8 +387,8 @@ def _faulty_line(stream: BinaryIO, message: str, read: int, layout: TableLayout)
 
     InputError where it complains of none.
     """
-    found = _TORN.search(message) or _CELL.search(message)
-    row = read + int(found[1] if found.re is _TORN else found[2]) if found else -1
+    found = _ROW.search(message)
+    row = read + int(found[1]) if found else -1
     stream.seek(layout.start)
     at, full = layout.start, 0
     for number, line in enumerate(stream, layout.first_line):
@@ -403,16 +403,15 @@ def _faulty_line(stream: BinaryIO, message: str, read: int, layout: TableLayout)
 def _fault(message: str, layout: TableLayout, line: Line) -> InputError:
     """The plain form of Arrow's message on a line of a text file."""
     where, cell = f"row {line.number}", _CELL.search(message)
-    if torn := _TORN.search(message):
-        known, text = {"expected": int(torn[2]), "actual": int(torn[3])}, torn[4]
-        clock = re.search(r"\d+:\d\d:\d\d,\d+", text) if layout.delimiter == "," else None
-        if known["actual"] > known["expected"] and re.fullmatch(r'[\s"0-9,+-]*', text):
+    if cell is None:
+        known = {"expected": len(layout.header), "actual": len(layout.cells(line.text))}
+        clock = re.search(r"\d+:\d\d:\d\d,\d+", line.text) if layout.delimiter == "," else None
+        if known["actual"] > known["expected"] and re.fullmatch(r'[\s"0-9,+-]*', line.text):
             return refusal("torn_at_decimals", where, **known)
         if known["actual"] > known["expected"] and clock:
             return refusal("torn_at_seconds", where, **known, clock=clock[0])
         return refusal("torn", where, **known)
-    assert cell is not None
-    column, value = layout.header[int(cell[1])], cell[3]
+    column, value = layout.header[int(cell[1])], cell[2]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     fitting = (r for r in VOCABULARY["no_numbers"] if re.fullmatch(r["cell"], value.strip()))
     remedy = str(next(fitting, {"remedy": ""})["remedy"])
