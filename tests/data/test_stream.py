@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bampipe.data.quality.channels import to_si
+from bampipe.data.quality.table import CleaningLimits, TrialTable
+from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import read_session, session_from
 from bampipe.data.session.conversion import Conversion
 from bampipe.data.stream import SampleStream, conversion_of_stream
@@ -134,3 +137,7 @@ def test_motors_that_several_joints_turn_give_the_positions_of_these():
     rows = Pipe((conversion_of_stream(session),)).write("t,a,b\n0,0.1,1.4\n1,0.2,\n2,,1.5\n")
     np.testing.assert_allclose(rows[:, 1], [0.1, 0.2, np.nan])
     np.testing.assert_allclose(rows[:, 2], [0.2, np.nan, np.nan], atol=1e-12)
+    raw = {"t": np.arange(2.0), "a": np.array([0.1, 0.2]), "b": np.array([1.4, 1.7])}
+    trial = RawTrial(raw, np.arange(2))
+    si = to_si(TrialTable(trial, session, session.trials[0], CleaningLimits()))
+    np.testing.assert_allclose([si["q_one"], si["q_two"]], [[0.1, 0.2], [0.2, 0.3]])
