@@ -18,7 +18,7 @@ from bampipe.data.angle_torque import (
     least_squares,
 )
 from bampipe.data.quality.clock import rate_of
-from bampipe.data.session import SECONDS, Register
+from bampipe.data.session.channels import SECONDS, Register
 from bampipe.data.units import spelled
 
 RATES_HZ = (4.0, 30_000.0)

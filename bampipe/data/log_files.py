@@ -13,8 +13,7 @@ from bampipe.data.readers import columns_of, extension_of, is_log, is_text
 from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import starts_of
 from bampipe.data.refusals import refusal
-from bampipe.data.session import TrialEntry
-from bampipe.data.session.file import lexically_inside
+from bampipe.data.session import TrialEntry, lexically_inside
 from bampipe.data.stated_rate import SMALL, units_stated
 from bampipe.data.vocabulary import by_word, word_set
 from bampipe.errors import InputError

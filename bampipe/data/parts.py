@@ -18,8 +18,8 @@ from bampipe.data.readers.moments import NANOSECONDS
 from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import MOST_APART
 from bampipe.data.refusals import refusal
-from bampipe.data.session import SECONDS, Part, TrialEntry
-from bampipe.data.session.channels import TimeUnit
+from bampipe.data.session import Part, TrialEntry
+from bampipe.data.session.channels import SECONDS, TimeUnit
 from bampipe.errors import InputError
 
 Columns = Mapping[str, str]

@@ -13,7 +13,8 @@ from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, check_columns, interpolated
 from bampipe.data.refusals import refusal
-from bampipe.data.session import SECONDS, Clock, Part, Session, TrialEntry, inside
+from bampipe.data.session import Part, Session, TrialEntry, inside
+from bampipe.data.session.channels import SECONDS, Clock
 from bampipe.errors import InputError
 from bampipe.files import digest_file
 

@@ -16,8 +16,8 @@ from bampipe.data.readers import is_text, lerobot
 from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import read_recording
 from bampipe.data.refusals import refusal
-from bampipe.data.session import Clock, TrialEntry
-from bampipe.data.session.channels import CLOCK_UNITS
+from bampipe.data.session import TrialEntry
+from bampipe.data.session.channels import CLOCK_UNITS, Clock
 from bampipe.data.stated_rate import intervals_stated
 from bampipe.data.units import RecordedUnit, spelled, unit
 from bampipe.data.vocabulary import VOCABULARY

@@ -6,7 +6,7 @@ import numpy as np
 
 from bampipe.arrays import find_runs
 from bampipe.data.quality.table import TrialTable, longest_run
-from bampipe.data.session import SECONDS, Channel, Encoder, Register
+from bampipe.data.session.channels import SECONDS, Channel, Encoder, Register
 from bampipe.data.session.conversion import Conversion
 from bampipe.data.units import unit
 from bampipe.lists import count_noun

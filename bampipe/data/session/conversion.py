@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from bampipe.arrays import Array
-from bampipe.data.session.file import Session
+from bampipe.data.session import Session
 
 
 @dataclass(frozen=True)
