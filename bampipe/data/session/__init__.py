@@ -14,14 +14,12 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, StringConstraints
 
 from bampipe import schema
 from bampipe.data.readers.trial import Dialect
 from bampipe.data.refusals import refusal
 from bampipe.data.session.channels import (
-    LARGEST_CONDITION,
     SECONDS,
     Brake,
     BrakeTable,
@@ -246,22 +244,6 @@ class Session(Declaration):
     def brakes(self) -> tuple[Brake, ...]:
         """Which column brakes which axis."""
         return self.brake_table.brakes(self.encoders) if self.brake_table else ()
-
-    @cached_property
-    def positions_by_reading(self) -> np.ndarray:
-        """Positions of the axes by the readings of their encoders, which may share motors, (n, n).
-
-        Raises:
-            InputError: some motion shows in no reading.
-        """
-        axes = [encoder.name for encoder in self.encoders]
-        reads = np.eye(len(axes))
-        for row, encoder in zip(reads, self.encoders, strict=True):
-            for other, share in encoder.also_reads.items():
-                row[axes.index(other)] = share
-        if not np.linalg.cond(reads) < LARGEST_CONDITION:
-            raise refusal("hidden_motion")
-        return np.linalg.inv(reads)
 
     @property
     def tick(self) -> float:

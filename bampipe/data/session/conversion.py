@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from bampipe.arrays import Array
+from bampipe.data.refusals import refusal
 from bampipe.data.session import Session
+from bampipe.data.session.channels import LARGEST_CONDITION
 
 
 @dataclass(frozen=True)
@@ -41,15 +43,26 @@ class Conversion:
 
     @staticmethod
     def of_session(session: Session) -> "Conversion":
-        """Columns as a session file describes its raw logs; registers hold what they stand for."""
+        """Columns as a session file describes its raw logs; registers hold what they stand for.
+
+        Raises:
+            InputError: some motion shows in no reading of motors that several joints turn.
+        """
         encoders, force = session.encoders, session.force
         brakes, channels = session.brakes, session.channels
+        axes = [e.name for e in encoders]
         columns = [session.clock.column, *(e.column for e in encoders)]
         columns += [*(force.columns if force else ()), *(b.column for b in brakes)]
         columns += [c.column for c in channels]
-        names = ["t", *(f"q_{e.name}" for e in encoders), *(force.names if force else ())]
+        names = ["t", *(f"q_{axis}" for axis in axes), *(force.names if force else ())]
         names += [*(f"brake_{b.axis}" for b in brakes), *(c.name for c in channels)]
-        readings = np.diag([e.scale for e in encoders]) @ session.positions_by_reading.T
+        reads = np.eye(len(encoders))
+        for row, encoder in zip(reads, encoders, strict=True):
+            for other, share in encoder.also_reads.items():
+                row[axes.index(other)] = share
+        if not np.linalg.cond(reads) < LARGEST_CONDITION:
+            raise refusal("hidden_motion")
+        readings = np.diag([e.scale for e in encoders]) @ np.linalg.inv(reads).T
         matrix = np.array(force.calibration).T if force else np.empty((0, 0))
         scales = [1.0] * len(brakes) + [c.scale for c in channels]
         offsets = (
