@@ -53,7 +53,7 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
     units = {column: layout.units[column] for column in wanted.columns if column in layout.units}
     return RawTrial(
         samples.values(),
-        np.concatenate(samples.lines),
+        samples.column(""),
         (*notes, *samples.notes),
         (*said, *layout.remarks),
         units,
@@ -209,12 +209,11 @@ def _head(stream: BinaryIO) -> bytes:
 
 @dataclass
 class _Samples:
-    """Samples read so far: the wanted columns and their lines in parts; see `RawTrial`."""
+    """Samples read so far, in batches of the wanted columns and, as "", their lines."""
 
     wanted: Wanted
     nothing: list[str] = field(default_factory=list)
-    parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    lines: list[np.ndarray] = field(default_factory=list)
+    batches: list[dict[str, np.ndarray]] = field(default_factory=list)
     rows: int = 0
     notes: list[str] = field(default_factory=list)
     resumed: bool = False
@@ -222,16 +221,16 @@ class _Samples:
     since: dict[str, int] = field(default_factory=dict)
 
     def add(self, batch: pa.RecordBatch, first_line: int) -> None:
+        held = {"": np.arange(first_line, first_line + batch.num_rows)}
         for column in self.wanted.columns:
             cells = batch.column(column)
             if column in self.wanted.datetimes:
                 form = self.wanted.datetimes[column]
                 with located(f"column '{column}'"):
-                    part = moments.nanoseconds(cells.to_pylist(), form, first_line)
+                    held[column] = moments.nanoseconds(cells.to_pylist(), form, first_line)
             else:
-                part = np.array(cells.to_numpy(zero_copy_only=False), dtype=np.float64)
-            self.parts.setdefault(column, []).append(part)
-        self.lines.append(np.arange(first_line, first_line + batch.num_rows))
+                held[column] = np.array(cells.to_numpy(zero_copy_only=False), dtype=np.float64)
+        self.batches.append(held)
         self.rows += batch.num_rows
         check_size(self.rows, self.wanted)
 
@@ -247,15 +246,12 @@ class _Samples:
         )
         return True
 
-    def cut(self, rows: int, parts: int) -> None:
-        """Forget all but the first ``rows``, which the first ``parts`` hold."""
-        self.rows = rows
-        for held in (self.lines, *self.parts.values()):
-            del held[parts:]
+    def column(self, name: str) -> np.ndarray:
+        """A column, whose batches are let go of, so that no other is held twice meanwhile."""
+        return np.concatenate([held.pop(name) for held in self.batches])
 
     def values(self) -> dict[str, np.ndarray]:
-        # Parts are let go of column by column, so that only one column is held twice.
-        values = {column: np.concatenate(self.parts.pop(column)) for column in self.wanted.columns}
+        values = {column: self.column(column) for column in self.wanted.columns}
         for column in self.wanted.datetimes:
             known = values[column][values[column] != np.iinfo(np.int64).min]
             self.since |= {column: int(known[0])} if len(known) else {}
@@ -269,14 +265,15 @@ def _read_samples(stream: BinaryIO, layout: TableLayout, end: int, samples: _Sam
     InputError where a row is damaged, or too many lines are text.
     """
     while True:
-        rows, parts = samples.rows, len(samples.lines)
+        rows, batches = samples.rows, len(samples.batches)
         try:
             _read_stretch(stream, layout, end, samples)
             return
         except pa.ArrowInvalid as error:
             line = _faulty_line(stream, str(error), samples.rows - rows, layout)
             again = layout.is_header(line.text)
-            samples.cut(rows, parts)
+            samples.rows = rows
+            del samples.batches[batches:]
             if not again and _is_end(stream, line, end, layout):
                 samples.notes.append(f"row {line.number} and what follows are no samples: left out")
                 end = line.start
