@@ -1,5 +1,6 @@
 """Samples as they come: lines of a growing text file or of a pipe, checked and in SI units."""
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -125,25 +126,21 @@ class SampleStream:
     def _samples(self, rows: Mapping[int, list[float]], layout: Conversion) -> Array:
         """The samples of rows of numbers, by number of the line."""
         raw, numbers = np.array([*rows.values()]), [*rows]
-        lost = np.isnan(raw) & layout.may_lack
-        numeric = np.isfinite(raw) | lost
+        lost = np.isnan(raw)
         with np.errstate(over="ignore", invalid="ignore"):
             values = np.where(lost, 0.0, raw) @ layout.gain + layout.offset
             large = ~(np.abs(values) <= LARGEST)
         values[lost @ (layout.gain != 0.0)] = np.nan  # and spoils nothing else
-        good = numeric.all(axis=1) & ~large.any(axis=1)
+        good = ~large.any(axis=1)
         time = np.where(good, raw[:, 0] * layout.gain[0, 0], -np.inf)
         before = np.maximum.accumulate(np.append(self._last, time))
         late = good & ~(time > before[:-1])
         for at in np.flatnonzero(~good | late):
             if late[at]:
                 self._skip(numbers[at], layout.columns[0], "the time does not increase")
-            elif numeric[at].all():
+            else:
                 name = layout.names[int(np.argmax(large[at]))]
                 self._skip(numbers[at], "", f"{name} is larger than {LARGEST:g}")
-            else:
-                column = int(np.argmin(numeric[at]))
-                self._skip(numbers[at], layout.columns[column], "no number")
         keep = good & ~late
         self._last = float(before[-1])
         if keep.any():
@@ -159,10 +156,11 @@ class SampleStream:
         for at, column, may_lack in zip(self._places, layout.columns, layout.may_lack, strict=True):
             text = cells[at].strip().strip("\"'")
             try:
+                row.append(float(text or "nan"))
+                known = math.isfinite(row[-1]) or (may_lack and math.isnan(row[-1]))
                 # float() also reads 1_0 and the digits of other scripts, which no logger writes.
-                if "_" in text or not text.isascii():
+                if not known or "_" in text or not text.isascii():
                     raise ValueError
-                row.append(np.nan if may_lack and not text else float(text))
             except ValueError:
                 self._skip(self._line, column, f"{text[:40]!r} is no number")
                 return []
