@@ -79,6 +79,7 @@ def _joint(entry: Element) -> TreeJoint:
         if element is None or not element.get("link"):
             raise InputError(f"no <{tag} link>")
         ends.append(str(element.get("link")))
+    parent, child = ends
     frame = _pose(entry.find("origin"))
     kind = entry.get("type", "")
     axis = numbers(entry.find("axis"), "xyz", "1 0 0", 3)
@@ -93,7 +94,7 @@ def _joint(entry: Element) -> TreeJoint:
     if follows is not None and follows.get("joint"):
         ratio = number(follows, "multiplier", "1")
         mimic = str(follows.get("joint")), ratio, number(follows, "offset")
-    return TreeJoint(_name(entry), kind, *ends, *frame, axis, limits, mimic)
+    return TreeJoint(_name(entry), kind, parent, child, *frame, axis, limits, mimic)
 
 
 def urdf_text(name: str, tree: Tree, comment: str) -> str:
