@@ -33,7 +33,7 @@ with atheris.instrument_imports(include=["bampipe", "tomllib", "nptdms", "mcap",
     from rosbags.typesys import Stores, get_typestore
 
     from bampipe.data.readers import columns_of, read_trial
-    from bampipe.data.session.file import session_from
+    from bampipe.data.session import session_from
     from bampipe.physics import expression, registry
     from bampipe.physics.effect import Effect
     from bampipe.physics.units import check_device, check_effect

@@ -67,7 +67,7 @@ def servo_pendulum(source: Path, folder: Path) -> None:
         'sample_rate_hz = 188.0\n[time]\ncolumn = "timestamp"\nunit = "s"\n[encoders]\n'
         'joint = { column = "position", unit = "rad", resolution = 1.5339807878853584e-3 }\n'
         f'[channels]\nduty = {{ column = "load", unit = "", scale = {1.0 / FULL_DUTY!r},'
-        ' wrap_bits = 16, signed = true }\nsupply = { column = "input_volts", unit = "V" }\n'
+        ' wrap_bits = 16 }\nsupply = { column = "input_volts", unit = "V" }\n'
     )
     for path in sorted(folder.glob("*.json")):
         text += f'[[trials]]\nfile = "{path.name}"\nkind = "free"\n'

@@ -10,6 +10,8 @@ from bampipe.arrays import Array
 
 _SMOOTHED_S = 0.06
 """Length of the window over which motion and input are smoothed before they are compared, s."""
+MOST_ROWS = 20_000
+"""Most rows of a log that guesses take."""
 Reading = Literal["gravity", "either", "both", "spring", "nothing"]
 
 _LEFT = 0.8

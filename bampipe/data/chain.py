@@ -1,7 +1,7 @@
 """A chain of joints out of a robot's file, as the plain tables that a device file holds."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import dropwhile, takewhile
 from pathlib import Path
 from typing import Any
@@ -36,26 +36,6 @@ class Branches(InputError):
     chains: Mapping[str, Sequence[tuple[str, str]]] = {}
 
 
-@dataclass(frozen=True)
-class Chain:
-    """The moving joints between the links ``base`` and ``tip``.
-
-    Attributes:
-        joints: by name, the entries of ``[robot.joints]``; limits: by name.
-        notes: what was left out or joined, one sentence each.
-        gravity: in the base's frame, m/s2; None if it is not known.
-        gravity_note: where that is from, or why it is not known, if that is not plain.
-    """
-
-    joints: Mapping[str, dict[str, Any]]
-    limits: Mapping[str, robot_tree.DriveLimits]
-    base: str
-    tip: str
-    notes: tuple[str, ...]
-    gravity: tuple[float, float, float] | None = None
-    gravity_note: str = ""
-
-
 def read_tree(path: Path) -> Tree:
     """Read the links and joints of a robot's file.
 
@@ -72,19 +52,26 @@ def read_tree(path: Path) -> Tree:
 
 
 def read_chain(
-    path: Path, base: str = "", tip: str = "", payload: Mapping[str, Any] | None = None
-) -> Chain:
-    """Read the chain of joints from ``base`` to ``tip``.
+    path: Path, robot: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, robot_tree.DriveLimits], list[str]]:
+    """Read the moving joints from the link ``base`` of a table ``[robot]`` to its ``tip``.
+
+    The root of the tree is the base that a table does not name, and its only end the tip. A
+    ``payload`` of the table is a body held there, in the frame of the tip.
 
     Args:
-        path: of a URDF or MJCF.
-        base: link that stands still; the root of the tree where empty.
-        tip: last link; where empty, the only end of the tree.
-        payload: ``mass``, ``center`` and ``inertia`` of a body held at the tip, in its frame.
+        path: of a URDF or MJCF; robot: the table.
+
+    Returns:
+        The table with its links, the entries of ``[robot.joints]`` and, where the file tells of it,
+        the gravity; limits of the joints' drives by name; and what was left out or joined, or where
+        the gravity is from, a sentence each.
 
     Raises:
         InputError: another file, a wrong joint or link, or no single chain between the links.
     """
+    base, tip = (x if isinstance(x := robot.get(key), str) else "" for key in ("base", "tip"))
+    payload = robot.get("payload")
     with located(str(path), ": "):
         tree = read_tree(path)
         _refuse_broken(tree)
@@ -94,20 +81,24 @@ def read_chain(
         tip = tip or _only_end(tree, base)
         tree, held_still = _hold_followers(tree, tree.path(base, tip))
         joints = tree.path(base, tip)
-        if payload is not None:
+        if isinstance(payload, Mapping):
             held = tree.bodies[tip].joined(robot_tree.Body.of_table(payload))
             tree = replace(tree, bodies={**tree.bodies, tip: held})
         moving = [joint for joint in joints if joint.kind != "fixed"]
         if not moving:
             raise InputError(f"no joint moves between {base!r} and {tip!r}")
-        lumped, notes = LumpedBodies(tree, moving), tree.notes
+        lumped = LumpedBodies(tree, moving)
         limits = {identifier(joint.name): joint.limits for joint in moving}
         held_still += [joint.name for start in moving for joint in lumped.held_on(start.child)]
+        notes = [*tree.notes]
         if held_still:
-            notes = (f"held at zero beside the chain: {join_names(held_still, _MANY)}", *notes)
-        return Chain(
-            _tables(joints, lumped), limits, base, tip, notes, *robot_tree.gravity_at(tree, base)
-        )
+            notes.insert(0, f"held at zero beside the chain: {join_names(held_still, _MANY)}")
+        found = {**robot, "joints": _tables(joints, lumped), "base": base, "tip": tip}
+        if "gravity" not in robot:
+            gravity, said = robot_tree.gravity_at(tree, base)
+            notes += [said] if said else []
+            found |= {"gravity": list(gravity)} if gravity else {}
+        return found, limits, notes
 
 
 def _hold_followers(tree: Tree, path: Sequence[TreeJoint]) -> tuple[Tree, list[str]]:

@@ -56,17 +56,8 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     if file is not None:
         from bampipe.data.chain import read_chain  # slow to import, and for robots alone
 
-        base, tip = (x if isinstance(x := robot.get(key), str) else "" for key in ("base", "tip"))
-        payload = robot.get("payload")
-        payload = payload if isinstance(payload, Mapping) else None
-        chain = read_chain(folder / file, base, tip, payload)
-        robot |= {"joints": dict(chain.joints), "base": chain.base, "tip": chain.tip}
-        notes = list(chain.notes)
-        if "gravity" not in robot:
-            notes += [chain.gravity_note] if chain.gravity_note else []
-            robot |= {"gravity": list(chain.gravity)} if chain.gravity else {}
-        limits = chain.limits
-        source = "; ".join([f"{file.name}, {chain.base} to {chain.tip}", *notes])
+        robot, limits, notes = read_chain(folder / file, robot)
+        source = "; ".join([f"{file.name}, {robot['base']} to {robot['tip']}", *notes])
     if isinstance(robot.get("dh"), Mapping) and "joints" not in robot:
         robot["joints"] = _from_dh(robot["dh"])
     joints = robot.get("joints")

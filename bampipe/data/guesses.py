@@ -10,6 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from bampipe.arrays import Array
 from bampipe.data.angle_torque import (
+    MOST_ROWS,
     AngleTorque,
     SmoothedMotion,
     angle_torque,
@@ -17,7 +18,7 @@ from bampipe.data.angle_torque import (
     least_squares,
 )
 from bampipe.data.quality.clock import rate_of
-from bampipe.data.session import SECONDS, Register
+from bampipe.data.session.channels import SECONDS, Register
 from bampipe.data.units import spelled
 
 RATES_HZ = (4.0, 30_000.0)
@@ -30,8 +31,6 @@ _SPANS, _STEP = (0.5, 10.0 * np.pi), 0.01
 _WEIGHT_LEAVES, _SURE_TURNING = 0.5, 0.03
 """Largest residual of a sine over that of a straight line, and the relative standard error up to
 which the scale of a reading is proposed."""
-_MOST_ROWS = 20_000
-"""Most rows that such guesses take."""
 _LEAST_SIGN_BIT, _SIGN_GAP = 7, 0.7
 """Lowest bit that is taken for a sign, and the largest magnitude, as a share of it, by which an
 empty range below the bit shows it."""
@@ -199,7 +198,7 @@ def find_turning(t: np.ndarray, q: np.ndarray, drive: np.ndarray) -> Turning | N
     motion = SmoothedMotion.of(t, q)
     if motion is None or np.ptp(q) == 0.0:
         return None
-    rows = np.arange(len(q))[motion.inner][:: max(1, len(q) // _MOST_ROWS)]
+    rows = np.arange(len(q))[motion.inner][:: max(1, len(q) // MOST_ROWS)]
     moving = np.column_stack([motion.moving, np.ones_like(q)])[rows]
     position, target = motion.position[rows], motion.smooth(drive)[rows]
     middle, span = float(np.median(position)), float(np.ptp(position))
@@ -281,7 +280,7 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
     "velocity", "acceleration" or "force" (what drives the motion).
     """
     found: dict[str, str] = {}
-    sound = {name: v[:_MOST_ROWS] for name, v in values.items() if np.all(np.isfinite(v))}
+    sound = {name: v[:MOST_ROWS] for name, v in values.items() if np.all(np.isfinite(v))}
     if t is None:
         clock = next((name for name, v in sound.items() if is_time(v)), "")
         found |= {clock: "time"} if clock else {}
@@ -289,7 +288,7 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
     if len(sound) < 2:
         return found
     matrix = np.column_stack(list(sound.values()))
-    t = np.arange(len(matrix), dtype=float) if t is None else t[:_MOST_ROWS]
+    t = np.arange(len(matrix), dtype=float) if t is None else t[:MOST_ROWS]
     if not np.all(np.isfinite(t)):
         return found
     names = list(sound)

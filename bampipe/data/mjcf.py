@@ -197,8 +197,7 @@ class _Reader:
                     turn = turn @ Rotation.from_rotvec(-self.angle(start) * along).as_matrix()
                 elif kind == "prismatic":
                     offset = offset - turn @ along * start
-                roll, pitch, yaw = Rotation.from_matrix(turn).as_euler("xyz")
-                frame = turn, offset, (roll, pitch, yaw)
+                frame = turn, offset, Rotation.from_matrix(turn).as_euler("xyz")
                 self.joints.append(TreeJoint(joint, kind, parent, child, *frame, axis, limits))
                 if child != name:
                     self.bodies[child] = Body()

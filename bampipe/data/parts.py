@@ -15,11 +15,11 @@ from bampipe.data import guesses
 from bampipe.data.names import role_of
 from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
-from bampipe.data.readers.trial import Dialect
+from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import MOST_APART
 from bampipe.data.refusals import refusal
-from bampipe.data.session import SECONDS, Part, TrialEntry
-from bampipe.data.session.channels import TimeUnit
+from bampipe.data.session import Part, TrialEntry
+from bampipe.data.session.channels import SECONDS, TimeUnit
 from bampipe.errors import InputError
 
 Columns = Mapping[str, str]
@@ -115,6 +115,14 @@ def join_parts(
     return trials, reasons
 
 
+def read_columns(
+    folder: Path, name: str, columns: Columns, wanted: Sequence[str], dialect: Dialect
+) -> RawTrial:
+    """Columns ``wanted`` of a file with ``columns``, of which those of moments become seconds."""
+    moments = {column: "" for column in wanted if columns[column] == "datetime"}
+    return read_trial(folder / name, wanted, name=name, datetimes=moments, dialect=dialect)
+
+
 def axes_of(names: Sequence[str]) -> dict[str, str]:
     """The axis in each name of a file, such as ``joint1.csv``; none unless they differ by it."""
     bare = {_AXIS.sub("", name) for name in names}
@@ -181,9 +189,7 @@ def _read_clock(
 ) -> FileClock:
     """The clock of a file, in the unit in which it lasts as long as one ``beside`` if unstated."""
     times = [column for column, unit in columns.items() if role_of(column, unit) == "time"]
-    datetimes = {column: "" for column in times if columns[column] == "datetime"}
-    wanted = times or list(columns)[:1]
-    raw = read_trial(folder / name, wanted, name=name, datetimes=datetimes, dialect=dialect)
+    raw = read_columns(folder, name, columns, times or list(columns)[:1], dialect)
     for column in times:
         stamps = raw.columns[column]
         known = stamps[np.isfinite(stamps)]

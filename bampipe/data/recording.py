@@ -13,7 +13,8 @@ from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, check_columns, interpolated
 from bampipe.data.refusals import refusal
-from bampipe.data.session import SECONDS, Clock, Part, Session, TrialEntry, inside
+from bampipe.data.session import Part, Session, TrialEntry, inside
+from bampipe.data.session.channels import SECONDS, Clock
 from bampipe.errors import InputError
 from bampipe.files import digest_file
 
@@ -81,10 +82,20 @@ def read_recording(
         if part.join == "rows" and places.get(clock.column, ("", ""))[0] == part.name:
             time = places[clock.column][1]
         other = read(part.name, part.file, time, part.time_unit or clock.unit)
+        if not raw.columns:
+            raw = other
+            continue
         if part.join == "rows":
-            raw = _by_rows(raw, other, entry, part)
+            start, stop, remark = _by_rows(raw, other, entry, part)
         else:
-            raw = _by_time(raw, other, entry, part, clock, time)
+            start, stop, remark = _by_time(raw, other, entry, part, clock, time)
+        raw = replace(
+            raw,
+            columns={**raw.columns, **other.columns},
+            units={**raw.units, **other.units},
+            notes=(*raw.notes, *other.notes),
+            remarks=(*raw.remarks, remark),
+        ).between(start, stop)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
     return _at_one_rate(_without_codes(_filled(_one_of(raw, entry, clock), clock), clock), clock)
 
@@ -208,10 +219,8 @@ def _place(column: str, entry: TrialEntry) -> tuple[str, str]:
     return "", column
 
 
-def _by_rows(raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part) -> RawTrial:
-    """The columns side by side, sample by sample."""
-    if not raw.columns:
-        return other
+def _by_rows(raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part) -> tuple[int, int, str]:
+    """Samples, from and to, in which a part stands beside those of the file; and that in words."""
     counts = len(raw), len(other)
     least, most = min(counts), max(counts)
     if most - least > max(1, MOST_APART * most):
@@ -220,15 +229,14 @@ def _by_rows(raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part) -> R
     if most > least:
         longer = entry.file if counts[0] == most else part.file
         remark += f"; the last {most - least} of {longer} left out"
-    joined = _with_columns(raw, other, {**raw.columns, **other.columns}, remark)
-    return joined.between(0, least)
+    return 0, least, remark
 
 
 def _by_time(
     raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part, clock: Clock, time: str
-) -> RawTrial:
-    """The columns of the part between its samples, by its ``time``, at the times of the others."""
-    t, u = raw.columns[clock.column], other.columns[time]
+) -> tuple[int, int, str]:
+    """As `_by_rows`, of a part whose columns it puts between their samples, by its ``time``."""
+    t, u = raw.columns[clock.column], other.columns.pop(time)
     t_0, u_0 = (float(x[np.isfinite(x)][:1].sum()) for x in (t, u))
     ticks = [SECONDS.get(unit, 1.0) for unit in (clock.unit, part.time_unit or clock.unit)]
     at, stamps = (t - t_0) * ticks[0], (u - u_0) * ticks[1]
@@ -238,25 +246,12 @@ def _by_time(
     span = min(np.nanmax(at), np.nanmax(stamps)) - max(np.nanmin(at), np.nanmin(stamps))
     if not span > 0.0:
         raise refusal("no_common_time", part.file, main=entry.file, late=np.nanmin(stamps))
-    kept = {name: values for name, values in other.columns.items() if name != time}
-    found = {name: interpolated(at, stamps, values) for name, values in kept.items()}
+    for name, values in other.columns.items():
+        other.columns[name] = interpolated(at, stamps, values)
     remark = f"{part.file} interpolated linearly at the times of {entry.file}"
     remark += f" (at most {np.nanmax(np.diff(stamps)):.3g} s apart)"
     within = np.flatnonzero((at >= np.nanmin(stamps)) & (at <= np.nanmax(stamps)))
-    joined = _with_columns(raw, other, {**raw.columns, **found}, remark)
-    return joined.between(int(within[0]), int(within[-1]) + 1)
-
-
-def _with_columns(
-    raw: RawTrial, other: RawTrial, columns: dict[str, np.ndarray], remark: str
-) -> RawTrial:
-    return replace(
-        raw,
-        columns=columns,
-        units={**raw.units, **other.units},
-        notes=(*raw.notes, *other.notes),
-        remarks=(*raw.remarks, remark),
-    )
+    return int(within[0]), int(within[-1]) + 1, remark
 
 
 def _one_of(raw: RawTrial, entry: TrialEntry, clock: Clock) -> RawTrial:

@@ -10,12 +10,11 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.data.refusals import refusal
+from bampipe.data.robot_xml import DEEPEST
 from bampipe.errors import InputError
 
 _BELOW_ZERO = 1e-6
 """Share of the largest second moment of mass by which one may be below zero."""
-DEEPEST = 200
-"""Most links one behind another."""
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 """Kinds of joint that move a chain, and their names in a device file."""
 UPRIGHT = (0.0, 0.0, -9.81)
@@ -120,7 +119,7 @@ class TreeJoint:
     child: str
     turn: Array
     offset: Array
-    angles: tuple[float, float, float]
+    angles: Sequence[float]
     axis: list[float]
     limits: DriveLimits = DriveLimits()
     mimic: tuple[str, float, float] | None = None
@@ -227,12 +226,12 @@ def tree_of_tables(tables: Mapping[str, Mapping[str, Any]]) -> Tree:
     for name, table in tables.items():
         link, after = f"{name}_link", table.get("after")
         bodies[link] = Body.of_table(table)
-        roll, pitch, yaw = (float(v) for v in table.get("rotation", (0.0,) * 3))
-        turn = Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix()
+        angles = [float(v) for v in table.get("rotation", (0.0,) * 3)]
+        turn = Rotation.from_euler("xyz", angles).as_matrix()
         offset = np.array(table.get("position", (0.0,) * 3), dtype=float)
         axis = [float(v) for v in table.get("axis", (0.0, 0.0, 1.0))]
         ends = f"{after}_link" if after else "base", link
-        joint = TreeJoint(name, str(table["kind"]), *ends, turn, offset, (roll, pitch, yaw), axis)
+        joint = TreeJoint(name, str(table["kind"]), *ends, turn, offset, angles, axis)
         if other := table.get("follows"):
             mimic = str(other), float(table.get("ratio", 1)), float(table.get("zero", 0))
             joint = replace(joint, mimic=mimic)
@@ -244,8 +243,7 @@ def fixed_joint(name: str, parent: str, child: str, turn: Array, offset: Array) 
     """A joint that does not move, between two links."""
     from scipy.spatial.transform import Rotation
 
-    roll, pitch, yaw = (float(v) for v in Rotation.from_matrix(turn).as_euler("xyz"))
-    frame = turn, offset, (roll, pitch, yaw)
+    frame = turn, offset, Rotation.from_matrix(turn).as_euler("xyz")
     return TreeJoint(name, "fixed", parent, child, *frame, [0.0, 0.0, 1.0])
 
 

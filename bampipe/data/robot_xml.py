@@ -13,7 +13,7 @@ from bampipe.files import read_bytes
 LARGEST_BYTES = 20_000_000
 _MEND = "mend it, or take it out of the folder"
 DEEPEST = 200
-"""Most elements inside one another."""
+"""Most elements inside one another, and links one behind another."""
 Attribute = str | float | Iterable[float]
 """Attribute of an element: text, a number or several."""
 

@@ -12,8 +12,8 @@ from bampipe.data.readers.trial import NUMBER
 from bampipe.data.units import unit
 from bampipe.data.vocabulary import word_set
 
-_SMALL = 1 << 16
-"""Largest text about logs that is read, bytes."""
+SMALL = 1 << 16
+"""Bytes below which a text is read as notes on logs, or may be no log but a line of results."""
 _NOTES = word_set("notes")
 """File extensions of texts about logs."""
 _STATEMENT = re.compile(
@@ -85,7 +85,7 @@ def units_stated(
 
 def _notes(folder: Path) -> list[Path]:
     notes = (path for path in sorted(folder.rglob("*")) if extension_of(path.name) in _NOTES)
-    return [p for p in notes if p.is_file() and p.stat().st_size < _SMALL]
+    return [p for p in notes if p.is_file() and p.stat().st_size < SMALL]
 
 
 def _numbers_of(path: Path, is_log: bool) -> Iterator[tuple[str, float, str]]:

@@ -1,16 +1,17 @@
 """Samples as they come: lines of a growing text file or of a pipe, checked and in SI units."""
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bampipe.arrays import Array
 from bampipe.data.readers.trial import check_columns
 from bampipe.data.refusals import refusal
 from bampipe.data.session import Session
+from bampipe.data.session.conversion import Conversion
 from bampipe.errors import InputError
 
 PORTION = 1 << 16
@@ -22,67 +23,23 @@ LARGEST = 1e15
 MOST_COMPLAINTS = 3
 
 
-@dataclass(frozen=True)
-class StreamLayout:
-    """Meaning of the columns of a stream: SI values = raw @ gain + offset, time first.
+def conversion_of_stream(session: Session) -> Conversion:
+    """Conversion of a stream with the columns of a session's raw logs.
 
-    Attributes:
-        columns: (k,) columns needed, the time first.
-        names: (m,) what they become: ``t`` (s), ``q_<axis>``, ``force_<c>``, ``brake_<axis>``, ...
-        gain: (k, m); offset: (m,).
-        may_lack: (k,) columns that may be empty: positions, which the filter bridges.
+    Raises:
+        InputError: time as dates, counted samples, or registers that wrap.
     """
-
-    columns: tuple[str, ...]
-    names: tuple[str, ...]
-    gain: Array
-    offset: Array
-    may_lack: NDArray[np.bool_]
-
-    @staticmethod
-    def in_si(names: Sequence[str]) -> "StreamLayout":
-        """Columns that are named and measured as in ``ingest/samples.parquet``."""
-        columns = ("t", *names)
-        return StreamLayout(
-            columns, columns, np.eye(len(columns)), np.zeros(len(columns)),
-            np.array([name.startswith("q_") for name in columns]),
-        )  # fmt: skip
-
-    @staticmethod
-    def of_session(session: Session) -> "StreamLayout":
-        """Columns as a session file describes its raw logs.
-
-        Raises:
-            InputError: time as dates, counted samples, or registers that wrap.
-        """
-        where = str(session.root / "session.toml")
-        clock = session.clock
-        if clock.datetime or clock.nanoseconds or not clock.column:
-            raise refusal("stream_time", f"{where}: time")
-        for rate in (encoder.name for encoder in session.encoders if encoder.integrate):
-            raise refusal("stream_velocity", where, axis=rate)
-        registers = [encoder.name for encoder in session.encoders if encoder.sign_bit]
-        registers += [c.name for c in session.channels if c.sign_bit or c.wrap_bits]
-        for register in registers:
-            raise refusal("stream_register", where, register=register)
-        known = [(clock.column, "t", session.tick, 0.0)]
-        known += [(e.column, f"q_{e.name}", e.scale, -e.zero * e.scale) for e in session.encoders]
-        known += [(b.column, f"brake_{b.axis}", 1.0, 0.0) for b in session.brakes]
-        known += [(c.column, c.name, c.scale, c.offset) for c in session.channels]
-        columns, names, scales, offsets = map(list, zip(*known, strict=True))
-        gain, offset = np.diag(scales), np.array(offsets)
-        axes = slice(1, 1 + len(session.encoders))
-        gain[axes, axes] = gain[axes, axes] @ session.positions_by_reading.T
-        offset[axes] = session.positions_by_reading @ offset[axes]
-        if force := session.force:
-            matrix = np.array(force.calibration).T
-            gain = np.pad(gain, ((0, len(force.columns)), (0, len(force.names))))
-            gain[len(known) :, len(known) :] = matrix
-            offset = np.append(offset, -np.array(force.zero) @ matrix)
-            columns, names = [*columns, *force.columns], [*names, *force.names]
-        may_lack = np.zeros(len(columns), dtype=bool)
-        may_lack[axes] = True
-        return StreamLayout(tuple(columns), tuple(names), gain, offset, may_lack)
+    where = str(session.root / "session.toml")
+    clock = session.clock
+    if clock.unit == "datetime" or clock.nanoseconds or not clock.column:
+        raise refusal("stream_time", f"{where}: time")
+    for rate in (encoder.name for encoder in session.encoders if encoder.integrate):
+        raise refusal("stream_velocity", where, axis=rate)
+    registers = [encoder.name for encoder in session.encoders if encoder.sign_bit]
+    registers += [c.name for c in session.channels if c.sign_bit or c.wrap_bits]
+    for register in registers:
+        raise refusal("stream_register", where, register=register)
+    return Conversion.of_session(session)
 
 
 @dataclass
@@ -99,12 +56,12 @@ class SampleStream:
 
     descriptor: int
     name: str
-    layouts: Sequence[StreamLayout]
+    layouts: Sequence[Conversion]
     strict: bool
     complain: Callable[[str], None]
     ended: bool = False
     bad_lines: int = 0
-    _layout: StreamLayout | None = None
+    _layout: Conversion | None = None
     _rest: bytes = b""
     _line: int = 0
     _last_good: int = 0
@@ -166,35 +123,31 @@ class SampleStream:
         self._layout, self._width, self._last_good = fitting[0], len(found), self._line
         self._places = tuple(found.index(name) for name in fitting[0].columns)
 
-    def _samples(self, rows: Mapping[int, list[float]], layout: StreamLayout) -> Array:
+    def _samples(self, rows: Mapping[int, list[float]], layout: Conversion) -> Array:
         """The samples of rows of numbers, by number of the line."""
         raw, numbers = np.array([*rows.values()]), [*rows]
-        lost = np.isnan(raw) & layout.may_lack
-        numeric = np.isfinite(raw) | lost
+        lost = np.isnan(raw)
         with np.errstate(over="ignore", invalid="ignore"):
             values = np.where(lost, 0.0, raw) @ layout.gain + layout.offset
             large = ~(np.abs(values) <= LARGEST)
         values[lost @ (layout.gain != 0.0)] = np.nan  # and spoils nothing else
-        good = numeric.all(axis=1) & ~large.any(axis=1)
+        good = ~large.any(axis=1)
         time = np.where(good, raw[:, 0] * layout.gain[0, 0], -np.inf)
         before = np.maximum.accumulate(np.append(self._last, time))
         late = good & ~(time > before[:-1])
         for at in np.flatnonzero(~good | late):
             if late[at]:
                 self._skip(numbers[at], layout.columns[0], "the time does not increase")
-            elif numeric[at].all():
+            else:
                 name = layout.names[int(np.argmax(large[at]))]
                 self._skip(numbers[at], "", f"{name} is larger than {LARGEST:g}")
-            else:
-                column = int(np.argmin(numeric[at]))
-                self._skip(numbers[at], layout.columns[column], "no number")
         keep = good & ~late
         self._last = float(before[-1])
         if keep.any():
             self._last_good = numbers[int(np.flatnonzero(keep)[-1])]
         return np.asarray(values[keep])
 
-    def _row(self, cells: list[str], layout: StreamLayout) -> list[float]:
+    def _row(self, cells: list[str], layout: Conversion) -> list[float]:
         """The numbers of a line; none where it is bad, which is said."""
         if len(cells) != self._width:
             self._skip(self._line, "", f"{len(cells)} cells where the header has {self._width}")
@@ -203,10 +156,11 @@ class SampleStream:
         for at, column, may_lack in zip(self._places, layout.columns, layout.may_lack, strict=True):
             text = cells[at].strip().strip("\"'")
             try:
+                row.append(float(text or "nan"))
+                known = math.isfinite(row[-1]) or (may_lack and math.isnan(row[-1]))
                 # float() also reads 1_0 and the digits of other scripts, which no logger writes.
-                if "_" in text or not text.isascii():
+                if not known or "_" in text or not text.isascii():
                     raise ValueError
-                row.append(np.nan if may_lack and not text else float(text))
             except ValueError:
                 self._skip(self._line, column, f"{text[:40]!r} is no number")
                 return []

@@ -79,7 +79,8 @@ def _joint(entry: Element) -> TreeJoint:
         if element is None or not element.get("link"):
             raise InputError(f"no <{tag} link>")
         ends.append(str(element.get("link")))
-    turn, offset, angles = _pose(entry.find("origin"))
+    parent, child = ends
+    frame = _pose(entry.find("origin"))
     kind = entry.get("type", "")
     axis = numbers(entry.find("axis"), "xyz", "1 0 0", 3)
     limit, losses = entry.find("limit"), entry.find("dynamics")
@@ -88,13 +89,12 @@ def _joint(entry: Element) -> TreeJoint:
     )
     drive = (number(limit, "effort"), number(limit, "velocity"))
     limits = DriveLimits(*ends_at, *drive, number(losses, "damping"), number(losses, "friction"))
-    shown = (angles[0], angles[1], angles[2])
     mimic = None
     follows = entry.find("mimic")
     if follows is not None and follows.get("joint"):
         ratio = number(follows, "multiplier", "1")
         mimic = str(follows.get("joint")), ratio, number(follows, "offset")
-    return TreeJoint(_name(entry), kind, ends[0], ends[1], turn, offset, shown, axis, limits, mimic)
+    return TreeJoint(_name(entry), kind, parent, child, *frame, axis, limits, mimic)
 
 
 def urdf_text(name: str, tree: Tree, comment: str) -> str:

@@ -53,7 +53,7 @@ class Monitor:
             self._start_filter(start)
 
     def push(self, names: Sequence[str], values: Array) -> None:
-        """Filter samples (T, m) with columns ``names``, as in a `StreamLayout`."""
+        """Filter samples (T, m) with columns ``names``, as in a `Conversion`."""
         brakes = {name: f"brake_{axis}" for axis, name in self.system.model.device.brakes.items()}
         for first in range(0, len(values), PORTION):
             part = values[first : first + PORTION]

@@ -10,7 +10,8 @@ import numpy as np
 from bampipe.arrays import Array
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import Session, read_session
-from bampipe.data.stream import SampleStream, StreamLayout
+from bampipe.data.session.conversion import Conversion
+from bampipe.data.stream import SampleStream, conversion_of_stream
 from bampipe.declarations.model_file import load_model, read_estimate
 from bampipe.errors import InputError
 from bampipe.estimate.consistency import find_threshold, window_means
@@ -97,7 +98,7 @@ class Start:
         )
 
 
-def list_layouts(system: System, session: Session | None) -> tuple[StreamLayout, ...]:
+def list_layouts(system: System, session: Session | None) -> tuple[Conversion, ...]:
     """Return the headers that a stream for this model may have.
 
     They are SI columns named as in ``ingest/samples.parquet``, with brake commands of zero if their
@@ -119,11 +120,11 @@ def list_layouts(system: System, session: Session | None) -> tuple[StreamLayout,
     positions = [f"q_{axis}" for axis in system.coordinates]
     others = [name for name in system.inputs if name not in brakes and name != "t"]
     commands = [brakes[name] for name in system.inputs if name in brakes]
-    found = [StreamLayout.in_si([*positions, *others, *commands])]
+    found = [Conversion.in_si([*positions, *others, *commands])]
     if commands:
-        found.append(StreamLayout.in_si([*positions, *others]))
+        found.append(Conversion.in_si([*positions, *others]))
     if session is not None:
-        found.append(StreamLayout.of_session(session))
+        found.append(conversion_of_stream(session))
     return tuple(found)
 
 

@@ -14,7 +14,8 @@ from bampipe.data.names import words
 from bampipe.data.quality.encoders import unwrapped
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.recording import describe_spans, read_recording
-from bampipe.data.session import Clock, TrialEntry
+from bampipe.data.session import TrialEntry
+from bampipe.data.session.channels import Clock
 from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.setup.proposal import propose
@@ -81,6 +82,7 @@ def test_units_of_properties_are_heard(tmp_path: Path):
             {"Name": "", "t": "0.01 s", "q": "0.1 Nm, if not applied"},
         ),
         (below, {"mSec": "", "TORQUE": "FT-LBS", "A (B)": "DEG"}),
+        (lines("{q:.4f},{u:.4f}", "x,y\nmrad,mrad\n"), {"x": "mrad", "y": "mrad"}),
         (lines("{t:.3f},{q:.4f}", "t [s],q (6064h)\n"), {"t [s]": "s", "q (6064h)": ""}),
         (lines("{t:.3f};{q:.4f}", "t / s;φ / X\n"), {"t / s": "s", "φ / X": ""}),
     ):

@@ -12,7 +12,8 @@ import pytest
 
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.recording import read_recording
-from bampipe.data.session import Clock, TrialEntry
+from bampipe.data.session import TrialEntry
+from bampipe.data.session.channels import Clock
 from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.setup.proposal import propose

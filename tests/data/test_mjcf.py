@@ -75,15 +75,15 @@ def test_the_dynamics_are_those_of_mujoco(tmp_path: Path, angles) -> None:
 
 def test_limits_and_losses_are_heard(tmp_path: Path) -> None:
     write(tmp_path, ARM.format(**DEGREES))
-    chain = read_chain(tmp_path / "arm.xml")
-    assert (chain.base, chain.tip) == ("world", "lower")
-    lift, bend, reach = (chain.limits[name] for name in ("lift", "bend", "reach"))
+    robot, limits, _ = read_chain(tmp_path / "arm.xml", {})
+    assert (robot["base"], robot["tip"]) == ("world", "lower")
+    lift, bend, reach = (limits[name] for name in ("lift", "bend", "reach"))
     assert (lift.lower, lift.upper) == pytest.approx((-np.pi / 2, np.pi / 3))
     assert (lift.effort, lift.damping, lift.friction) == (100.0, 0.5, 0.3)
     assert (lift.armature, bend.armature) == (0.04, 0.0)
     assert (bend.damping, bend.lower, bend.upper) == (0.1, 0.0, 0.0)
     assert (reach.effort, reach.damping) == (40.0, 0.5)
-    assert chain.gravity == (0.0, 1.5, -9.7)
+    assert robot["gravity"] == [0.0, 1.5, -9.7]
 
 
 @pytest.mark.parametrize(("motors", "ratio"), [("", 1.0), ("[robot.motors.m]\n", 10.0)])

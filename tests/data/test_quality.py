@@ -135,7 +135,7 @@ def test_a_trial_is_a_stretch_of_a_record():
 
 
 def test_an_unsigned_register_is_read_as_signed():
-    channel = {"column": "pwm", "unit": "", "scale": 0.5, "wrap_bits": 16, "signed": True}
+    channel = {"column": "pwm", "unit": "", "scale": 0.5, "wrap_bits": 16}
     session = session_from({**TABLE, "channels": {"duty": channel}}, Path())
     signed = np.rint(300 * np.sin(np.arange(N) / 40.0))
     raw = columns() | {"pwm": np.where(signed < 0, signed + 65536, signed)}

@@ -11,7 +11,6 @@ from bampipe.data.quality import CleaningLimits, CleanTrial, clean
 from bampipe.data.quality.clock import find_fresh_rows, spread_stamps, unroll
 from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import session_from
-from bampipe.errors import InputError
 
 RATE, N = 500.0, 6000
 T = np.arange(N) / RATE
@@ -161,26 +160,6 @@ def test_readings_at_a_rail_are_left_out_and_a_command_at_its_limit_is_not():
         q[k + 1] = q[k] + qd / RATE
     driven = cleaned({"t": T, "q": q, "u": force})
     assert np.mean(np.abs(force) == 1.2) > 0.1 and driven.dead == [] and driven.repairs == []
-
-
-@pytest.mark.parametrize(
-    ("tables", "said"),
-    [
-        ({"time": {"column": "t", "unit": "ticks"}}, "unit = \"ticks\" and ticks_per_s belong"),
-        ({"force": {"columns": ["u"], "unit": "N.m", "lever_m": 0.3}}, "is a torque already"),
-        ({"force": {"columns": ["u"], "unit": "N", "lever_m": 0.0}}, "found 0, expected the dist"),
-        (
-            {"channels": {"a": {"column": "a", "unit": "", "wrap_bits": 16, "signed": True,
-                                "sign_bit": 15}}},
-            "holds its sign in one way only",
-        ),
-        ({"channels": {"a": {"column": "a", "unit": "", "wrap_bits": 16}}}, "belong together"),
-        ({"channels": {"a": {"column": "a", "unit": "", "signed": True}}}, "belong together"),
-    ],
-)  # fmt: skip
-def test_contradictions_are_refused(tables: dict[str, Any], said: str):
-    with pytest.raises(InputError, match=said):
-        cleaned({"t": T, "q": moved(T), "u": T}, **tables)
 
 
 def test_ticks_and_levers_become_seconds_and_torques():

@@ -122,22 +122,6 @@ def test_one_record_gives_several_trials():
     record_in({}, {})  # the same file twice is for ingest to judge
 
 
-@pytest.mark.parametrize(
-    ("stretches", "said"),
-    [
-        (({"end_s": 4}, {"start_s": 3.9}), "trials[1]: overlaps trial r of the same file"),
-        (({}, {"start_s": 3.0}), "trials[1]: overlaps trial r"),
-        (({"start_s": 2, "end_s": 2},), "trials[0].end_s: found 2, expected more than start_s"),
-        (({"start_s": -1},), "trials[0].start_s"),
-        (({"end_s": "4"},), "trials[0].end_s"),
-    ],
-)
-def test_stretches_that_make_no_sense_are_refused(stretches, said):
-    with pytest.raises(InputError) as caught:
-        record_in(*stretches)
-    assert said in str(caught.value) and "\n" not in str(caught.value)
-
-
 def test_a_file_of_another_ending_is_pointed_out(tmp_path):
     (tmp_path / "A.parquet").write_text("")
     with pytest.raises(InputError, match=r"no such file 'a\.csv'; there is 'A\.parquet'"):

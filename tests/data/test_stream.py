@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bampipe.data.quality.channels import part_readings
+from bampipe.data.quality.channels import to_si
+from bampipe.data.quality.table import CleaningLimits, TrialTable
+from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import read_session, session_from
-from bampipe.data.stream import SampleStream, StreamLayout
+from bampipe.data.session.conversion import Conversion
+from bampipe.data.stream import SampleStream, conversion_of_stream
 from bampipe.errors import InputError
 
 SAMPLES = Path(__file__).parents[2] / "sample_runs"
-SI = StreamLayout.in_si(["q_yaw", "force_x"])
+SI = Conversion.in_si(["q_yaw", "force_x"])
 
 
 class Pipe:
@@ -62,10 +65,10 @@ def test_other_delimiters(delimiter):
         ("0.1,abc,1", "line 3, column q_yaw: 'abc' is no number"),
         ("0.1,1", "line 3: 2 cells where the header has 3"),
         ("0.1,1,", "line 3, column force_x: '' is no number"),
-        ("0.1,1,inf", "line 3, column force_x: no number"),
+        ("0.1,1,inf", "line 3, column force_x: 'inf' is no number"),
         ("0.0,1,1", "line 3, column t: the time does not increase"),
-        ("nan,1,1", "line 3, column t: no number"),
-        ("0.1,inf,1", "line 3, column q_yaw: no number"),
+        ("nan,1,1", "line 3, column t: 'nan' is no number"),
+        ("0.1,inf,1", "line 3, column q_yaw: 'inf' is no number"),
         ("0.1,1e308,1", "line 3: q_yaw is larger than 1e+15"),
         ("0.1,1,-1e308", "line 3: force_x is larger than 1e+15"),
         ("1e18,1,1", "line 3: t is larger than 1e+15"),
@@ -106,7 +109,7 @@ def test_what_is_no_log_is_refused_and_complaints_are_few():
 
 
 def test_raw_columns_of_a_session_become_si():
-    layout = StreamLayout.of_session(read_session(SAMPLES / "first"))
+    layout = conversion_of_stream(read_session(SAMPLES / "first"))
     pipe = Pipe((SI, layout))
     rows = pipe.write(
         "time_us,enc_yaw,enc_pitch,enc_extension,brake_yaw,brake_pitch,brake_extension,"
@@ -131,9 +134,10 @@ def test_motors_that_several_joints_turn_give_the_positions_of_these():
         },
     }  # fmt: skip
     session = session_from(table, Path())
-    rows = Pipe((StreamLayout.of_session(session),)).write("t,a,b\n0,0.1,1.4\n1,0.2,\n2,,1.5\n")
+    rows = Pipe((conversion_of_stream(session),)).write("t,a,b\n0,0.1,1.4\n1,0.2,\n2,,1.5\n")
     np.testing.assert_allclose(rows[:, 1], [0.1, 0.2, np.nan])
     np.testing.assert_allclose(rows[:, 2], [0.2, np.nan, np.nan], atol=1e-12)
-    si = {"q_one": np.array([0.1, 0.2]), "q_two": np.array([0.4, 0.7])}
-    part_readings(session, si)
-    np.testing.assert_allclose(si["q_two"], [0.2, 0.3])
+    raw = {"t": np.arange(2.0), "a": np.array([0.1, 0.2]), "b": np.array([1.4, 1.7])}
+    trial = RawTrial(raw, np.arange(2))
+    si = to_si(TrialTable(trial, session, session.trials[0], CleaningLimits()))
+    np.testing.assert_allclose([si["q_one"], si["q_two"]], [[0.1, 0.2], [0.2, 0.3]])

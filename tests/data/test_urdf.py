@@ -58,9 +58,9 @@ ARM = (
 
 
 def test_a_chain_is_read_with_what_is_fixed_to_it_and_held_beside_it(tmp_path: Path) -> None:
-    chain = read_chain(write(tmp_path, *ARM))
-    assert list(chain.joints) == ["shoulder_pan", "elbow"]
-    elbow = chain.joints["elbow"]
+    joints = read_chain(write(tmp_path, *ARM), {})[0]["joints"]
+    assert list(joints) == ["shoulder_pan", "elbow"]
+    elbow = joints["elbow"]
     assert elbow["after"] == "shoulder_pan"
     assert elbow["mass"] == pytest.approx(1.5)  # the tool is part of it
     assert elbow["center"] == pytest.approx([(0.25 + 0.5 * 0.5) / 1.5, 0.0, 0.0])
@@ -69,13 +69,13 @@ def test_a_chain_is_read_with_what_is_fixed_to_it_and_held_beside_it(tmp_path: P
     assert elbow["inertia"][0] == pytest.approx(0.2 + 0.1)
     assert elbow["inertia"][3] == pytest.approx(0.1 + 0.2 + apart)
     held = {"mass": 1.5, "center": [0.2, 0.0, 0.0]}
-    chain = read_chain(write(tmp_path, *ARM), tip="tool", payload=held)
-    assert chain.joints["elbow"]["mass"] == pytest.approx(3.0)
+    robot, _, _ = read_chain(write(tmp_path, *ARM), {"tip": "tool", "payload": held})
+    assert robot["joints"]["elbow"]["mass"] == pytest.approx(3.0)
     finger = (link("finger", 0.1), joint("grip", "tool", "finger", "prismatic", x=0.0))
-    chain = read_chain(write(tmp_path, *ARM, *finger), tip="tool")
-    assert list(chain.joints) == ["shoulder_pan", "elbow"]
-    assert chain.joints["elbow"]["mass"] == pytest.approx(1.6)
-    assert chain.notes == ("held at zero beside the chain: grip",)
+    robot, _, notes = read_chain(write(tmp_path, *ARM, *finger), {"tip": "tool"})
+    assert list(robot["joints"]) == ["shoulder_pan", "elbow"]
+    assert robot["joints"]["elbow"]["mass"] == pytest.approx(1.6)
+    assert notes == ["held at zero beside the chain: grip"]
 
 
 def test_a_device_file_needs_no_more_than_the_urdf(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_what_is_no_chain_is_refused_with_a_remedy(
     parts: tuple[str, ...], what: str, remedy: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError) as caught:
-        read_chain(write(tmp_path, *parts))
+        read_chain(write(tmp_path, *parts), {})
     assert what in caught.value.what and remedy in caught.value.remedy
 
 
@@ -145,7 +145,7 @@ def test_damaged_files_are_refused(text: str, what: str, tmp_path: Path) -> None
     path = tmp_path / "arm.urdf"
     path.write_text(text)
     with pytest.raises(InputError, match=what):
-        read_chain(path)
+        read_chain(path, {})
 
 
 def test_limits_below_zero_are_unknown_and_no_urdf_lies_outside_the_folder(tmp_path: Path) -> None:
@@ -265,10 +265,10 @@ def test_gravity_is_that_of_the_root_above_the_base(
     tmp_path: Path, kind: str, rpy: str, axis: str, gravity: tuple[float, ...] | None, said: str
 ) -> None:
     mount = TILT.format(name="mount", kind=kind, rpy=rpy, axis=axis)
-    chain = read_chain(write(tmp_path, *ARM, '<link name="world"/>', mount), base="base")
-    assert chain.gravity == (None if gravity is None else pytest.approx(gravity))
-    assert said in chain.gravity_note and bool(said) == bool(chain.gravity_note)
     parts, base = (*ARM, '<link name="world"/>', mount), 'base = "base"\n'
+    robot, _, notes = read_chain(write(tmp_path, *parts), {"base": "base"})
+    assert robot.get("gravity") == (None if gravity is None else pytest.approx(list(gravity)))
+    assert said in "".join(notes) and bool(said) == bool(notes)
     device = device_of(tmp_path, base, parts)
     assert device.robot is not None and said in device.declaration["source"]
     assert device.robot.gravity == pytest.approx(gravity or (0.0, 0.0, -9.81))
@@ -329,6 +329,6 @@ def test_what_follows_a_joint_beside_the_chain_is_held(tmp_path: Path) -> None:
     beside = joint("side", "l1", "l9", x=0.1)
     parts = (*chain_of(3), link("l9"), beside)
     parts = tuple(following(p, "side", 2.0, 0.0) if 'name="j1"' in p else p for p in parts)
-    chain = read_chain(write(tmp_path, *parts), tip="l3")
-    assert list(chain.joints) == ["j0", "j2"]
-    assert any("held at zero" in note and "j1" in note for note in chain.notes)
+    robot, _, notes = read_chain(write(tmp_path, *parts), {"tip": "l3"})
+    assert list(robot["joints"]) == ["j0", "j2"]
+    assert any("held at zero" in note and "j1" in note for note in notes)

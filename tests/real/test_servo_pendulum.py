@@ -26,7 +26,7 @@ unit = "s"
 [encoders]
 joint = {{ column = "position", unit = "rad", resolution = 1.5339807878853584e-3 }}
 [channels]
-duty = {{ column = "load", unit = "", scale = {duty!r}, wrap_bits = 16, signed = true }}
+duty = {{ column = "load", unit = "", scale = {duty!r}, wrap_bits = 16 }}
 supply = {{ column = "input_volts", unit = "V" }}
 goal = {{ column = "goal_position", unit = "rad" }}
 """

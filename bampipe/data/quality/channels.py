@@ -6,7 +6,8 @@ import numpy as np
 
 from bampipe.arrays import find_runs
 from bampipe.data.quality.table import TrialTable, longest_run
-from bampipe.data.session import SECONDS, Channel, Encoder, Register, Session
+from bampipe.data.session.channels import SECONDS, Channel, Encoder, Register
+from bampipe.data.session.conversion import Conversion
 from bampipe.data.units import unit
 from bampipe.lists import count_noun
 from bampipe.results.ingest import DeadStretch
@@ -107,51 +108,22 @@ def refuse_frozen(table: TrialTable, column: str) -> None:
 def to_si(table: TrialTable) -> dict[str, np.ndarray]:
     """Columns (T,) in SI units by name: q_<axis>, force_<component>, brake_<axis>, channels."""
     session, raw = table.session, table.columns
-    si: dict[str, np.ndarray] = {}
-    source: dict[str, str] = {}
-    for encoder in session.encoders:
-        values = raw.pop(encoder.column)
-        values -= encoder.zero
-        values *= encoder.scale
-        si[f"q_{encoder.name}"] = values
-        source[f"q_{encoder.name}"] = encoder.column
-    part_readings(session, si)
-    if session.force is not None:
-        force = session.force
-        for column, zero in zip(force.columns, force.zero, strict=True):
-            _refuse_wild(table, raw[column], "reads", column, column)
-            raw[column] -= zero
-        for name, gains in zip(force.names, force.calibration, strict=True):
-            total = np.zeros(len(table))
-            for column, gain in zip(force.columns, gains, strict=True):
-                if gain != 0.0:
-                    total += gain * raw[column]
-            si[name] = total
-            # A fault of a component is laid to the column that weighs most in it.
-            source[name] = force.columns[int(np.argmax(np.abs(gains)))]
-        for column in force.columns:
-            del raw[column]
-    for brake in session.brakes:
-        si[f"brake_{brake.axis}"] = raw.pop(brake.column)
-        source[f"brake_{brake.axis}"] = brake.column
-    for channel in session.channels:
-        values = raw.pop(channel.column)
-        values *= channel.scale
-        values += channel.offset
-        si[channel.name] = values
-        source[channel.name] = channel.column
-    for name, values in si.items():
-        _refuse_wild(table, values, "gives", name, source[name])
+    for column in session.force.columns if session.force is not None else ():
+        _refuse_wild(table, raw[column], "reads", column, column)
+    known, si = Conversion.of_session(session), dict[str, np.ndarray]()
+    uses = np.count_nonzero(known.gain, axis=1)
+    for k, name in enumerate(known.names[1:], 1):
+        for at in np.flatnonzero(known.gain[:, k]):
+            uses[at] -= 1
+            # A column that nothing else needs is used up: together they may fill the memory.
+            values = raw[known.columns[at]] if uses[at] else raw.pop(known.columns[at])
+            term = np.multiply(values, known.gain[at, k], out=None if uses[at] else values)
+            si[name] = np.add(si[name], term, out=si[name]) if name in si else term
+        si[name] += known.offset[k]
+        # A fault is laid to the column that weighs most.
+        source = known.columns[int(np.argmax(np.abs(known.gain[:, k])))]
+        _refuse_wild(table, si[name], "gives", name, source)
     return si
-
-
-def part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
-    """Take the positions of joints out of the readings of motors that several of them turn."""
-    if not any(encoder.also_reads for encoder in session.encoders):
-        return
-    names = [f"q_{encoder.name}" for encoder in session.encoders]
-    positions = session.positions_by_reading @ np.stack([si[name] for name in names])
-    si |= dict(zip(names, positions, strict=True))
 
 
 def to_signed(table: TrialTable, source: Channel | Encoder) -> None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bampipe.arrays import Array, find_runs
 from bampipe.data.quality.table import TrialTable, in_times, longest_run
-from bampipe.data.session import SECONDS
+from bampipe.data.session.channels import SECONDS
 from bampipe.lists import count_noun
 
 COARSEST_STAMP = 0.05

@@ -7,7 +7,7 @@ from scipy.ndimage import median_filter
 from bampipe.arrays import Array, Indices
 from bampipe.data.quality.channels import fill_missing, take_out
 from bampipe.data.quality.table import TrialTable, in_times
-from bampipe.data.session import Encoder
+from bampipe.data.session.channels import Encoder
 from bampipe.lists import count_noun
 
 FASTEST = {"rad": 20.0, "m": 4.0}

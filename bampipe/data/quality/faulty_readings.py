@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bampipe.arrays import Array, Flags, find_runs
-from bampipe.data.angle_torque import SmoothedMotion, least_squares
+from bampipe.data.angle_torque import MOST_ROWS, SmoothedMotion, least_squares
 from bampipe.data.quality.channels import fill_missing, take_out
 from bampipe.data.quality.table import TrialTable, longest_run
 from bampipe.results.ingest import DeadStretch
@@ -47,8 +47,6 @@ _EXPLAINED = 0.5
 """Share of the variance between the rails that the motion must explain to predict it beyond."""
 _ONE_STEP, _MATTERS = 0.85, 1e-3
 """Least share of an input's residual that one step explains; least residual, of its variance."""
-_MOST_ROWS = 20_000
-"""Most rows of that regression."""
 _BEYOND = 2.0
 """Least mean excess of the predicted input over the rail, in deviations of its residual."""
 
@@ -242,7 +240,7 @@ def refuse_new_zero(table: TrialTable) -> None:
     Devices with another input that may be switched on, such as a brake, are not tested, nor are
     commands, which go in steps.
     """
-    every = max(1, len(table) // _MOST_ROWS)
+    every = max(1, len(table) // MOST_ROWS)
     force, motions = table.session.force, _motions(table, every)
     if force is None or not motions or table.session.brakes or table.session.channels:
         return

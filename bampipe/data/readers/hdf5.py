@@ -67,11 +67,12 @@ def _arrays(file: Any, alone: bool) -> Iterator[tuple[str, Stored]]:
 
     Such a matrix is yielded itself, too, unless its columns are wanted ``alone``.
     """
-    for label, data in _datasets(file):
+    known = dict(_datasets(file))
+    for label, data in known.items():
         if data is None:
             yield label, stored(None, kind=LINK)
             continue
-        names = _names(data)
+        names = _names(data, known.get(f"{label.removesuffix('_values')}_items"))
         kind = "U" if data.attrs.get("MATLAB_class") == b"char" else data.dtype.kind
         for at, field in enumerate(data.dtype.names or (None,)):
             kind = data.dtype[field].kind if field else kind
@@ -111,12 +112,10 @@ def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[st
                 yield from _datasets(within, f"{name}/", inner)
 
 
-def _names(data: Any) -> list[str]:
-    """Names that the file gives to the columns of a matrix: beside it, or as pandas stores them."""
-    items = data.name.removesuffix("_values") + "_items"
+def _names(data: Any, beside: Any) -> list[str]:
+    """Names that the file gives to the columns of a matrix: with it, or ``beside`` it by pandas."""
     width = min((extent for extent in data.shape if extent != 1), default=0)
     found = next((data.attrs[key] for key in data.attrs if _COLUMNS.fullmatch(key)), ())
-    beside = dict(_datasets(data.parent)).get(items.rpartition("/")[2])
     if not np.size(found) and beside is not None and beside.shape == (width,):
         found = beside[()]
     texts = _texts(np.ravel(found))

@@ -115,9 +115,8 @@ def of_properties(row: list[str]) -> tuple[list[str], bool]:
     if len([*filter(_PROPERTY.match, said)]) >= 0.5 * len(said) > 0:
         return [_PROPERTY.sub("", cell) for cell in row], True
     key = row[0] if row else ""
-    listed = re.match(r"[^\W\d_]{3}", key) is not None and key.lower() not in ("sec", "rad", "deg")
-    alone = row.count(key) > 1 or unit(key) is None
-    if not (listed and alone):
+    numbers = any(POINT.match(cell) and cell != "1" for cell in said)  # as the Min of a channel
+    if not re.match(r"[^\W\d_]{3}", key) or not (numbers or unit(key) is None):
         return row, False
     return ["" if cell == key else cell for cell in row], True
 
@@ -289,13 +288,8 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
     plain, bare = (cells(t, delimiter) for t in (text, without_mark(text)))
     written = (line.text for line in below if not is_remark(line.text))
     rows = list(islice(written, SEARCHED))
-    if len(plain) == len(bare):
-        row = bare if is_remark(text) and plain[0].strip("#%/") else plain
-    else:
-        row = plain if rows and len(cells(rows[0], delimiter)) == len(plain) else bare
-    if delimiter == " ":
-        row = [name.rstrip(",;") or name for name in row]
-    row = [name.strip("\"'") for name in row]
+    row = bare if is_remark(text) and plain[0].strip("#%/") else plain
+    row = [(name.rstrip(",;") or name).strip("\"'") for name in row]
     beside = cells(above[-1].text, delimiter) if above else []
     if len(beside) == len(row) and sum(map(bool, beside)) > 1:
         # The names of an index stand below those of the columns, as pandas writes them; else a cell

@@ -78,12 +78,8 @@ def _iso_of_local(text: pd.Series) -> pd.Series:
     Whether 03/10 is in March or October shows where a date beyond the 12th stands in the column, or
     does not matter where it is the only date.
     """
-    first = text.dropna().head(1)
-    if (
-        not len(first)
-        or (seen := _LOCAL.match(str(first.iloc[0]))) is None
-        or not (seen["a"] or seen["half"])
-    ):
+    seen = _LOCAL.match(next(iter(text.dropna()), ""))
+    if seen is None or not (seen["a"] or seen["half"]):
         return text
     parts = text.str.extract(_LOCAL)
     day, month = parts["a"], parts["b"]

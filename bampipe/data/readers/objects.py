@@ -28,11 +28,11 @@ _TRIED = 400
 def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
     """Arrays (T,) or (T, k) of numbers, or (T,) of moments, in a parsed text, by their paths."""
     if isinstance(value, dict):
+        lists = [item for item in value.values() if isinstance(item, list)]
+        named = [[_name_of(x) for x in own] for own in lists]
+        texts = [own for own in named if all(isinstance(x, str) and x for x in own)]
+        names = [own for own in texts if len(set(own)) == len(own)]
         for key, item in value.items():
-            lists = [other for other in value.values() if isinstance(other, list)]
-            named = [[_name_of(x) for x in own] for own in lists]
-            texts = [own for own in named if all(isinstance(x, str) and x for x in own)]
-            names = [own for own in texts if len(set(own)) == len(own)]
             inner = f"{path}.{key}" if path else str(key)
             for label, array in _arrays(item, inner):
                 width = array.shape[-1] if array.ndim == 2 else 0

@@ -53,7 +53,7 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
     units = {column: layout.units[column] for column in wanted.columns if column in layout.units}
     return RawTrial(
         samples.values(),
-        np.concatenate(samples.lines),
+        samples.column(""),
         (*notes, *samples.notes),
         (*said, *layout.remarks),
         units,
@@ -209,12 +209,11 @@ def _head(stream: BinaryIO) -> bytes:
 
 @dataclass
 class _Samples:
-    """Samples read so far: the wanted columns and their lines in parts; see `RawTrial`."""
+    """Samples read so far, in batches of the wanted columns and, as "", their lines."""
 
     wanted: Wanted
     nothing: list[str] = field(default_factory=list)
-    parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    lines: list[np.ndarray] = field(default_factory=list)
+    batches: list[dict[str, np.ndarray]] = field(default_factory=list)
     rows: int = 0
     notes: list[str] = field(default_factory=list)
     resumed: bool = False
@@ -222,40 +221,37 @@ class _Samples:
     since: dict[str, int] = field(default_factory=dict)
 
     def add(self, batch: pa.RecordBatch, first_line: int) -> None:
+        held = {"": np.arange(first_line, first_line + batch.num_rows)}
         for column in self.wanted.columns:
             cells = batch.column(column)
             if column in self.wanted.datetimes:
                 form = self.wanted.datetimes[column]
                 with located(f"column '{column}'"):
-                    part = moments.nanoseconds(cells.to_pylist(), form, first_line)
+                    held[column] = moments.nanoseconds(cells.to_pylist(), form, first_line)
             else:
-                part = np.array(cells.to_numpy(zero_copy_only=False), dtype=np.float64)
-            self.parts.setdefault(column, []).append(part)
-        self.lines.append(np.arange(first_line, first_line + batch.num_rows))
+                held[column] = np.array(cells.to_numpy(zero_copy_only=False), dtype=np.float64)
+        self.batches.append(held)
         self.rows += batch.num_rows
         check_size(self.rows, self.wanted)
 
     def passes_over(self, message: str, line: Line, layout: TableLayout) -> bool:
         """Whether a word stands where a number is expected: no reading, as "OVERLOAD" says."""
         cell = _CELL.search(message)
-        if not cell or not _NO_READING.fullmatch(cell[3]) or len(self.nothing) == _MOST_WORDS:
+        if not cell or not _NO_READING.fullmatch(cell[2]) or len(self.nothing) == _MOST_WORDS:
             return False
-        self.nothing.append(cell[3])
+        self.nothing.append(cell[2])
         column = layout.header[int(cell[1])]
         self.notes.append(
-            f"column '{column}' says '{cell[3]}' from row {line.number} on: taken as no reading"
+            f"column '{column}' says '{cell[2]}' from row {line.number} on: taken as no reading"
         )
         return True
 
-    def cut(self, rows: int, parts: int) -> None:
-        """Forget all but the first ``rows``, which the first ``parts`` hold."""
-        self.rows = rows
-        for held in (self.lines, *self.parts.values()):
-            del held[parts:]
+    def column(self, name: str) -> np.ndarray:
+        """A column, whose batches are let go of, so that no other is held twice meanwhile."""
+        return np.concatenate([held.pop(name) for held in self.batches])
 
     def values(self) -> dict[str, np.ndarray]:
-        # Parts are let go of column by column, so that only one column is held twice.
-        values = {column: np.concatenate(self.parts.pop(column)) for column in self.wanted.columns}
+        values = {column: self.column(column) for column in self.wanted.columns}
         for column in self.wanted.datetimes:
             known = values[column][values[column] != np.iinfo(np.int64).min]
             self.since |= {column: int(known[0])} if len(known) else {}
@@ -269,14 +265,15 @@ def _read_samples(stream: BinaryIO, layout: TableLayout, end: int, samples: _Sam
     InputError where a row is damaged, or too many lines are text.
     """
     while True:
-        rows, parts = samples.rows, len(samples.lines)
+        rows, batches = samples.rows, len(samples.batches)
         try:
             _read_stretch(stream, layout, end, samples)
             return
         except pa.ArrowInvalid as error:
             line = _faulty_line(stream, str(error), samples.rows - rows, layout)
             again = layout.is_header(line.text)
-            samples.cut(rows, parts)
+            samples.rows = rows
+            del samples.batches[batches:]
             if not again and _is_end(stream, line, end, layout):
                 samples.notes.append(f"row {line.number} and what follows are no samples: left out")
                 end = line.start
@@ -378,8 +375,8 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
 _NO_READING = re.compile(r"[^\d\s\"\\][^\d\"\\]{0,19}|[-+]?1\.#\w+|#[A-Z]+[/\d!?]*")
 """Words for no reading, numbers of old C libraries among them."""
 _MOST_WORDS = 8
-_TORN = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", re.DOTALL)
-_CELL = re.compile(r"In CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", re.DOTALL)
+_ROW = re.compile(r"Row #(\d+): ")
+_CELL = re.compile(r"In CSV column #(\d+): .*invalid value '(.*)'", re.DOTALL)
 
 
 def _faulty_line(stream: BinaryIO, message: str, read: int, layout: TableLayout) -> Line:
@@ -387,8 +384,8 @@ def _faulty_line(stream: BinaryIO, message: str, read: int, layout: TableLayout)
 
     InputError where it complains of none.
     """
-    found = _TORN.search(message) or _CELL.search(message)
-    row = read + int(found[1] if found.re is _TORN else found[2]) if found else -1
+    found = _ROW.search(message)
+    row = read + int(found[1]) if found else -1
     stream.seek(layout.start)
     at, full = layout.start, 0
     for number, line in enumerate(stream, layout.first_line):
@@ -403,16 +400,15 @@ def _faulty_line(stream: BinaryIO, message: str, read: int, layout: TableLayout)
 def _fault(message: str, layout: TableLayout, line: Line) -> InputError:
     """The plain form of Arrow's message on a line of a text file."""
     where, cell = f"row {line.number}", _CELL.search(message)
-    if torn := _TORN.search(message):
-        known, text = {"expected": int(torn[2]), "actual": int(torn[3])}, torn[4]
-        clock = re.search(r"\d+:\d\d:\d\d,\d+", text) if layout.delimiter == "," else None
-        if known["actual"] > known["expected"] and re.fullmatch(r'[\s"0-9,+-]*', text):
+    if cell is None:
+        known = {"expected": len(layout.header), "actual": len(layout.cells(line.text))}
+        clock = re.search(r"\d+:\d\d:\d\d,\d+", line.text) if layout.delimiter == "," else None
+        if known["actual"] > known["expected"] and re.fullmatch(r'[\s"0-9,+-]*', line.text):
             return refusal("torn_at_decimals", where, **known)
         if known["actual"] > known["expected"] and clock:
             return refusal("torn_at_seconds", where, **known, clock=clock[0])
         return refusal("torn", where, **known)
-    assert cell is not None
-    column, value = layout.header[int(cell[1])], cell[3]
+    column, value = layout.header[int(cell[1])], cell[2]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     fitting = (r for r in VOCABULARY["no_numbers"] if re.fullmatch(r["cell"], value.strip()))
     remedy = str(next(fitting, {"remedy": ""})["remedy"])

@@ -100,17 +100,12 @@ class Clock(Declaration):
     fraction_unit: Literal["ns", "us", "ms"] = "ns"
     """Of that column, if it counts otherwise"""
 
-    @property
-    def datetime(self) -> bool:
-        """Whether it holds dates and times, which are read as s since the first."""
-        return self.unit == "datetime"
-
     def cross_faults(self) -> Iterator[InputError]:
         if self.unit == "samples" and self.column:
             yield refusal("clock_counts")
         if self.unit != "samples" and not self.column:
             yield refusal("clock_lacks")
-        if self.format and not self.datetime:
+        if self.format and self.unit != "datetime":
             yield InputError('only for unit = "datetime"', where="format")
         if (self.unit == "ticks") != (self.ticks_per_s is not None):
             yield refusal("clock_ticks")
@@ -378,7 +373,7 @@ class Register(NamedTuple):
     def fields(self) -> str:
         """What the session file says of it, after a comma."""
         if self.bits:
-            return f", wrap_bits = {self.bits}, signed = true"
+            return f", wrap_bits = {self.bits}"
         return f", sign_bit = {self.sign_bit}"
 
     @property
@@ -411,10 +406,8 @@ class Channel(NamedDeclaration):
     scale_sd: Uncertainty = 0.0
     """Standard uncertainty of its scale, as a share: 0.01 for 1 %"""
     wrap_bits: Literal[8, 16, 24, 32] | None = None
-    """The column is a register of so many bits; with signed = true its upper half stands for
-    negative numbers (two's complement)"""
-    signed: bool = False
-    """Whether a register of wrap_bits holds negative numbers"""
+    """The column is a register of so many bits, whose upper half stands for negative numbers
+    (two's complement)"""
     sign_bit: SignBit = None
     second_encoder_of: str = ""
     """Axis of which it reads the position on the other side of the gear, in the axis' unit: how far
@@ -448,7 +441,5 @@ class Channel(NamedDeclaration):
     def cross_faults(self) -> Iterator[InputError]:
         if self.stated_scale == 0.0:
             yield InputError("found 0, expected another number", where="scale")
-        if self.signed != (self.wrap_bits is not None):
-            yield refusal("signed_alone")
         if self.sign_bit is not None and self.wrap_bits is not None:
             yield refusal("two_signs")

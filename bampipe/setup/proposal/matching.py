@@ -9,7 +9,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.guesses import is_time
 from bampipe.data.names import DRIVERS, REFERENCE_WORDS, words
-from bampipe.data.session import Register
+from bampipe.data.session.channels import Register
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import TORQUES, is_of_motor, travelled

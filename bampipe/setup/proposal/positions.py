@@ -11,7 +11,7 @@ from bampipe.data.names import DRIVERS, words
 from bampipe.data.quality.clock import find_fresh_rows
 from bampipe.data.quality.encoders import unwrapped
 from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_spikes
-from bampipe.data.session import Register
+from bampipe.data.session.channels import Register
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import unit
 from bampipe.data.vocabulary import word_set

@@ -10,7 +10,7 @@ from bampipe.data import guesses
 from bampipe.data.names import words
 from bampipe.data.quality.clock import spread_stamps, unroll
 from bampipe.data.refusals import refusal
-from bampipe.data.session import SECONDS, Register
+from bampipe.data.session.channels import SECONDS, Register
 from bampipe.data.stated_rate import interval_of
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.data.units import bare, spelled, unit
