@@ -68,7 +68,8 @@ def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array,
     reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
     longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
     added = (len(longer) - len(values)) // 2
-    return low_pass_at(longer, cutoff_hz, rate_hz, slice(None)), added
+    everything = np.arange(len(longer))
+    return low_pass_at(longer[:, None], cutoff_hz, rate_hz, everything)[:, 0], added
 
 
 def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
