@@ -417,6 +417,10 @@ class _Logs:
             if role and clock.column != column and re.search(r":column_\d+$|\[0\]$", column):
                 # A column without a header, or of a matrix, may be named after the others.
                 role = "time" if is_time(raw.columns[column][sound]) else role
+            # The number of a message is named by its topic, like the readings beside it.
+            role = (
+                role if role in ("time", "reference") or not _is_count(raw.columns[column]) else ""
+            )
             unit = unit_of(column, said, role)
             factor = FACTOR.search(column)
             if unit and factor and factor[0] not in unit:
@@ -467,6 +471,12 @@ class _Logs:
             + (", ..." if len(starts) > 4 else "")
         )
         return [trial.model_copy(update={"recording": n}) for n, _ in enumerate(starts, 1)]
+
+
+def _is_count(values: np.ndarray) -> bool:
+    """Whether values (T,) rise by the same step from each row to the next."""
+    steps = np.diff(values)
+    return len(steps) > 3 and bool(np.ptp(steps) < 1e-6 * np.min(steps))
 
 
 def _like(path: Path) -> str:

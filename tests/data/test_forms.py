@@ -61,6 +61,44 @@ def test_texts_that_are_no_plain_tables(tmp_path: Path, name: str):
         np.testing.assert_allclose(trial.columns[column][known], values[known], atol=1e-9)
 
 
+def test_stamps_of_which_a_part_is_not_padded_or_counts_days(tmp_path: Path):
+    path, ms = tmp_path / "a.csv", np.arange(60) * 35
+    path.write_text("t,q\n" + "".join(f"{n // 1000}.{n % 1000},{n}\n" for n in ms))
+    np.testing.assert_allclose(read_trial(path, ("t",)).columns["t"], ms / 1000.0)
+    path.write_text("t,q\n" + "".join(f"0.{n % 1000:03d},{n}\n" for n in ms))
+    np.testing.assert_allclose(read_trial(path, ("t",)).columns["t"], ms % 1000 / 1000.0)
+    path.write_text("t,q\n" + "".join(f"123:23:59:{n / 1000.0 + 20:06.3f},{n}\n" for n in ms))
+    trial = read_trial(path, ("t",), datetimes={"t": ""})
+    np.testing.assert_allclose(trial.columns["t"], ms / 1000.0)
+
+
+def test_objects_of_json_stand_behind_one_another_and_say_their_types(tmp_path: Path):
+    objects = ({"_id": {"$oid": f"a{n}"}, "n": {"$numberLong": str(n)}, "q": n} for n in range(9))
+    path = tmp_path / "a.json"
+    path.write_text("\n".join(json.dumps(each, indent=1) for each in objects))
+    assert columns_of(path) == {"n": "", "q": ""}
+    np.testing.assert_array_equal(read_trial(path, ("n",)).columns["n"], np.arange(9))
+
+
+def test_formulas_without_results_are_refused(tmp_path: Path):
+    book = pytest.importorskip("openpyxl").Workbook()
+    for row in (("t", "u", "force"), *((n, n, f"=B{n}*50") for n in range(2, 9))):
+        book.active.append(row)
+    book.save(tmp_path / "a.xlsx")
+    with pytest.raises(InputError, match="column 'force': formulas without their results"):
+        columns_of(tmp_path / "a.xlsx")
+
+
+def test_the_numbers_of_messages_are_no_positions(tmp_path: Path):
+    rows, t = np.arange(600.0), np.arange(600) / 100.0
+    q = np.sin(5 * t) + np.sin(2 * t)
+    names = ("seq,stamp,q", "seq,stamp,torque.x,torque.y")
+    write(tmp_path / "1_joint_states.csv", names[0], rows, t, q)
+    write(tmp_path / "1_wrench.csv", names[1], 4 * rows, t, rows % 7, np.gradient(q) * 900 + q)
+    found = {column.name: column.role for column in survey(tmp_path).columns}
+    assert found["joint_states:seq"] == found["wrench:seq"] == ""
+
+
 def test_units_of_properties_are_heard(tmp_path: Path):
     path = tmp_path / "a.csv"
     rate = lines(";{t:.3f};{q:.4f};{u:.4f}", "Name:;t;q;u\nUnit:;s;°;Nm\nRate:;9 Hz;9 Hz;9 Hz\n")

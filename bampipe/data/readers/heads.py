@@ -22,7 +22,7 @@ NULLS = ("", "nan", "NaN", "NAN", "NA", "N/A", "n/a", "#N/A", "null", "NULL", "N
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
 POINT = re.compile(rf"{NUMBER}\Z")
 _COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
-_REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?")
+_REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?((?i:columns|fields): +(?=\w+ ?[\[(,]))?")
 _BYTE_ORDER = b"\xef\xbb\xbf"
 _PROPERTY = re.compile(r"\A[A-Za-z ]+:\s+(?=\S)")
 """Key before what a cell says of a channel: ``Type: double``."""
@@ -169,6 +169,14 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
         check_columns(listed, columns, "the list of columns")
         return Header(first - 1, mark, listed)
     if index < 0:
+        above = cells(lines[first - 1].text, mark) if 0 < first < len(lines) else []
+        if (
+            mark == ","
+            and 2 * len(above) == width
+            and all(re.match(r"[-+\d]+\Z", x) for x in samples)
+        ):
+            place, known = f"row {lines[first].number}", {"actual": width, "expected": len(above)}
+            raise refusal("torn_at_decimals", place, **known)
         row = [f"{_NUMBERED}{n}" for n, _ in enumerate(samples, 1)]
         if set(columns) <= set(row):
             return Header(first - 1, mark, row)
