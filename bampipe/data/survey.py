@@ -39,6 +39,8 @@ _MOST_SCANNED = 1 << 30
 _OTHER = "other columns, for another session"
 _WHOLE = 2
 """Of logs that hold both a motion and what drives it."""
+_ON_CIRCLE = 0.01
+"""Largest deviation of two readings from a cosine and a sine."""
 _RISES = 0.8
 """Share of samples at which a clock rises, if what else it does is an accident."""
 _AXES = word_set("axes")
@@ -153,7 +155,8 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
             logs.passed.append((trial.file, str(error)))
     if not read:
         raise logs.fault()
-    columns, guessed = _by_looks(_with_commands(list(read)), folder)
+    columns, said = _of_angles(read)
+    columns, guessed = _by_looks(_with_commands(list(columns)), folder)
     # The first unit of a quantity is that of the first column which looks like it.
     units = [(x, u) for x, u in reversed(logs.beside.items()) if unit(u) is not None]
     beside: dict[str, Any] = {role_of(x, u): {"quantity": x, "unit": u} for x, u in units}
@@ -163,7 +166,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     )
     if wanted is not None:
         logs.remarks = [VOCABULARY["remarks"]["lerobot"]]
-    remarks, timed = (*logs.remarks, *guessed), any(c.role == "time" for c in columns)
+    remarks, timed = (*logs.remarks, *said, *guessed), any(c.role == "time" for c in columns)
     stated = {} if timed else intervals_stated(folder, {trial.file for trial in sound})
     return Survey(tuple(sound), columns, remarks, tuple(logs.passed), stated)
 
@@ -536,6 +539,24 @@ def _by_looks(
     return tuple(
         replace(c, role=roles[c.name], by_looks=True) if c.name in roles else c for c in columns
     ), [guessed]
+
+
+def _of_angles(
+    columns: tuple[SurveyedColumn, ...],
+) -> tuple[tuple[SurveyedColumn, ...], list[str]]:
+    """The columns, cosines and sines of one angle without a role, and these in words."""
+    within = [c for c in columns if re.search("(?i)cos|sin", c.name) and not c.is_constant]
+    pairs = [
+        (one, other)
+        for one, other in combinations(within, 2)
+        if np.max(np.abs(np.hypot(one.values, other.values) - 1.0)) < _ON_CIRCLE
+    ]
+    parts = {c.name for pair in pairs for c in pair}
+    columns = tuple(replace(c, role="") if c.name in parts else c for c in columns)
+    return columns, [
+        VOCABULARY["remarks"]["circle"].format(one=one.name, other=other.name)
+        for one, other in pairs
+    ]
 
 
 def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:

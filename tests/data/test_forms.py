@@ -99,6 +99,26 @@ def test_the_numbers_of_messages_are_no_positions(tmp_path: Path):
     assert found["joint_states:seq"] == found["wrench:seq"] == ""
 
 
+def test_cosine_and_sine_are_no_positions(tmp_path: Path):
+    write(
+        tmp_path / "a.csv", "t,cos_theta,sin_theta,theta_dot,torque", T, np.cos(Q), np.sin(Q), U, U
+    )
+    found = survey(tmp_path)
+    assert [c.role for c in found.columns] == ["time", "", "", "velocity", "force"]
+    assert "cos_theta and sin_theta are cosine and sine of an angle" in found.remarks[0]
+
+
+def test_signals_of_dspace_say_which_clock_is_theirs(tmp_path: Path):
+    x = [("slow", T[None, ::4], 0.0), ("fast", T[None], 0.0)]
+    y = [("q [deg]", T[None, ::4], 1.0), ("u", U[None], 2.0)]
+    kinds = [("Name", object), ("Data", object), ("XIndex", object)]
+    log = {"X": np.array(x, kinds)[None], "Y": np.array(y, kinds)[None]}
+    scipy.io.savemat(tmp_path / "a.mat", {"exp_1": log})
+    trial = read_trial(tmp_path / "a.mat", ("Y.u@time", "Y.q deg", "Y.u"))
+    np.testing.assert_allclose(trial.columns["Y.q deg"][:57], trial.columns["Y.u@time"][:57])
+    np.testing.assert_array_equal(trial.columns["Y.u"], U)
+
+
 def test_units_of_properties_are_heard(tmp_path: Path):
     path = tmp_path / "a.csv"
     rate = lines(";{t:.3f};{q:.4f};{u:.4f}", "Name:;t;q;u\nUnit:;s;°;Nm\nRate:;9 Hz;9 Hz;9 Hz\n")

@@ -287,8 +287,8 @@ def _fitted(row: list[str], text: str, width: int) -> list[str]:
 
 
 def _counted(name: str) -> list[str]:
-    """The names of as many columns as a name says behind it: ``q[2]`` is q[0] and q[1]."""
-    match = re.fullmatch(r"(\S+)\[(\d{1,2})\]", name)
+    """The names of as many columns as a name says behind it: ``q[2]``, ``q(1:2)``."""
+    match = re.fullmatch(r"(\S+)[\[(](?:1:)?(\d{1,2})[\])]", name)
     return [f"{match[1]}[{k}]" for k in range(int(match[2]))] if match else [name]
 
 
@@ -322,7 +322,19 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
     first = [cells(text, delimiter)[0] for text in rows] if unnamed else []
     if first and all("." in x or is_moment(x) for x in first):
         row[0] = "index" if "time" in row else "time"  # of a frame of pandas; R numbers its rows
-    return _told_apart(row, beside)
+    return _told_apart(_spread(row, rows[0] if rows else "", delimiter), beside)
+
+
+def _spread(header: list[str], below: str, delimiter: str) -> list[str]:
+    """The header with ``q[0]``, ``q[1]`` where names stand over the first of as many columns."""
+    starts = [n for n, name in enumerate(header) if name]
+    spans = [(a, b) for a, b in pairwise([*starts, len(header)]) if b > a + 1]
+    samples = cells(below, delimiter)
+    filled = all(map(POINT.match, samples)) and len(samples) == len(header)
+    if len(spans) > 1 and len({b - a for a, b in spans}) == 1 and filled:
+        for a, b in spans:
+            header = [*header[:a], *(f"{header[a]}[{k}]" for k in range(b - a)), *header[b:]]
+    return header
 
 
 def _is_key_of_names(row: list[str]) -> bool:
