@@ -99,6 +99,28 @@ def test_the_numbers_of_messages_are_no_positions(tmp_path: Path):
     assert found["joint_states:seq"] == found["wrench:seq"] == ""
 
 
+def test_rows_with_the_newest_first_are_turned_round(tmp_path: Path):
+    rows = [f"2026-03-01T23:59:59.{n:03d},{n}\n" for n in range(60)]
+    (tmp_path / "a.csv").write_text("t,q\n" + "".join(rows[::-1]))
+    entry, clock = TrialEntry(file="a.csv", kind="free"), Clock(column="t", unit="datetime")
+    raw = read_recording(tmp_path, entry, ("t", "q"), clock)
+    np.testing.assert_array_equal(raw.columns["q"], np.arange(60))
+    np.testing.assert_allclose(raw.columns["t"], np.arange(60) / 1000.0)
+    assert raw.rows[0] == 61 and "the newest row stands first" in raw.notes[0]
+
+
+def test_a_counter_of_turns_is_no_position_and_files_without_names_are_named(tmp_path: Path):
+    fine, t = np.round(3e4 * np.cumsum(Q)).astype(int) + 30_000, np.arange(60) / 100.0
+    write(tmp_path / "a/a.csv", "t,enc_turns,enc_pos,force_N", t, fine >> 16, fine & 0xFFFF, U)
+    proposal = propose(tmp_path / "a")
+    assert 'column = "enc_pos"' in proposal.session
+    assert "enc_turns counts the turns of enc_pos, which is unwrapped" in proposal.check
+    (tmp_path / "a/b.csv").write_text("1,2,3,4\n" * 9)
+    assert ("b.csv", "no header; to read it like a.csv: --names t,enc_turns,enc_pos,force_N") in (
+        survey(tmp_path / "a").passed
+    )
+
+
 def test_cosine_and_sine_are_no_positions(tmp_path: Path):
     write(
         tmp_path / "a.csv", "t,cos_theta,sin_theta,theta_dot,torque", T, np.cos(Q), np.sin(Q), U, U
