@@ -155,8 +155,8 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
             logs.passed.append((trial.file, str(error)))
     if not read:
         raise logs.fault()
-    columns, said = _of_angles(read)
-    columns, guessed = _by_looks(_with_commands(list(columns)), folder)
+    known, said = _of_angles(read)
+    columns, guessed = _by_looks(_with_commands(known), folder)
     # The first unit of a quantity is that of the first column which looks like it.
     units = [(x, u) for x, u in reversed(logs.beside.items()) if unit(u) is not None]
     beside: dict[str, Any] = {role_of(x, u): {"quantity": x, "unit": u} for x, u in units}
@@ -424,9 +424,8 @@ class _Logs:
                 # A column without a header, or of a matrix, may be named after the others.
                 role = "time" if is_time(raw.columns[column][sound]) else role
             # The number of a message is named by its topic, like the readings beside it.
-            role = (
-                role if role in ("time", "reference") or not _is_count(raw.columns[column]) else ""
-            )
+            if role not in ("time", "reference") and _is_count(raw.columns[column]):
+                role = ""
             unit = unit_of(column, said, role)
             factor = FACTOR.search(column)
             if unit and factor and factor[0] not in unit:
@@ -544,22 +543,15 @@ def _by_looks(
     ), [guessed]
 
 
-def _of_angles(
-    columns: tuple[SurveyedColumn, ...],
-) -> tuple[tuple[SurveyedColumn, ...], list[str]]:
+def _of_angles(columns: Sequence[SurveyedColumn]) -> tuple[list[SurveyedColumn], list[str]]:
     """The columns, cosines and sines of one angle without a role, and these in words."""
     within = [c for c in columns if re.search("(?i)cos|sin", c.name) and not c.is_constant]
-    pairs = [
-        (one, other)
-        for one, other in combinations(within, 2)
-        if np.max(np.abs(np.hypot(one.values, other.values) - 1.0)) < _ON_CIRCLE
-    ]
-    parts = {c.name for pair in pairs for c in pair}
-    columns = tuple(replace(c, role="") if c.name in parts else c for c in columns)
-    return columns, [
-        VOCABULARY["remarks"]["circle"].format(one=one.name, other=other.name)
-        for one, other in pairs
-    ]
+    off = [(x, y, np.hypot(x.values, y.values) - 1.0) for x, y in combinations(within, 2)]
+    pairs = [(x.name, y.name) for x, y, each in off if np.max(np.abs(each)) < _ON_CIRCLE]
+    said = VOCABULARY["remarks"]["circle"]
+    parts = {name for pair in pairs for name in pair}
+    plain = [replace(c, role="") if c.name in parts else c for c in columns]
+    return plain, [said.format(one=one, other=other) for one, other in pairs]
 
 
 def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:

@@ -126,7 +126,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     # Records of several kinds may stand in turn.
     first = [cell for sample in samples[:_TRIED] for cell in leaves(sample)]
     filled = Counter(x for x, cell in first if cell is not None)
-    read = Counter(x for x, cell in first if _is_reading(cell))
+    read = Counter(x for x, cell in first if reads_as_number(cell) or _is_moment(cell))
     named = [x for x, count in read.items() if 2 * count > filled[x]]  # no digits of an identifier
     asked = wanted.columns if wanted else ()
     named += [x for x in asked if any(find(s, x) is not MISSING for s in samples[:_TRIED])]
@@ -161,10 +161,6 @@ def _column(samples: Sequence[object], name: str, units: Mapping[str, str]) -> S
 def _cells(samples: Sequence[object], name: str) -> Iterator[object]:
     found = (find(sample, name) if name else sample for sample in samples)
     return (None if cell is MISSING else cell for cell in found)
-
-
-def _is_reading(cell: object) -> bool:
-    return reads_as_number(cell) or _is_moment(cell)
 
 
 def _is_moment(cell: object) -> bool:

@@ -117,7 +117,8 @@ def signed_readings(found: Survey, notes: Notes) -> tuple[Survey, dict[str, Regi
         copied = next(alike, "") if c.role in DRIVERS and not c.is_constant else ""
         if copied:
             notes.check.append(f"{c.name} repeats {copied} in another unit, and drives nothing")
-        turning = next((p.name for p in positions if _counts_turns(c.values, p.values)), "")
+        others = (p for p in positions if p is not c and _counts_turns(c.values, p.values))
+        turning = next((p.name for p in others), "")
         if turning:
             notes.check.append(f"{c.name} counts the turns of {turning}, which is unwrapped")
         values = registers[c.name].signed(c.values) if c.name in registers else c.values
