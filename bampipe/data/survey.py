@@ -417,6 +417,10 @@ class _Logs:
             if end[one] == end[other] and step and np.nanmax(np.abs(here - there)) > step:
                 raise refusal("own_times", trial.file, one=one, other=other)
         found = []
+        # Elsewhere, _in may be an input.
+        imperial = any(
+            re.search(r"(\b|_)(lbs?|lbf|kip|psi)\b", f"{c} {labels[c]}") for c in ordered
+        )
         for column in ordered:
             said = raw.units.get(column, labels[column])
             role = role_of(column, said)
@@ -427,6 +431,8 @@ class _Logs:
             if role not in ("time", "reference") and _is_count(raw.columns[column]):
                 role = ""
             unit = unit_of(column, said, role)
+            if imperial and role == "position" and column.endswith("_in"):
+                unit = unit or "in"
             factor = FACTOR.search(column)
             if unit and factor and factor[0] not in unit:
                 unit = said = f"{unit}, {factor[0].strip('_. (')}"

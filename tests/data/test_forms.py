@@ -478,6 +478,9 @@ def test_speeds_in_hertz_commands_and_one_reading_in_two_units(tmp_path):
     names = "time [s],commanded angle [rad],a1 position [rad],c1 position [rev],a1 torque [Nm]"
     write(tmp_path / "b/b.csv", names, T, np.roll(Q, -3), Q, Q / TURN, U)
     assert 'column = "a1 position [rad]"' in propose(tmp_path / "b").session
+    for drive, length in (("load_lbf", "in"), ("load_N", "m")):
+        write(tmp_path / "e/a.csv", f"t [s],stroke_in,{drive}", T, Q, U)
+        assert f'column = "stroke_in", unit = "{length}"' in propose(tmp_path / "e").session
     (tmp_path / "d").mkdir()
     table = np.c_[T, Q, U, 3.0 * U].tolist()
     rows = {"force units": "kip", "displacement units": "in", "data": table}
