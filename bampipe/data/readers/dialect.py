@@ -66,7 +66,8 @@ class TableLayout:
     def begins_another(self, text: str) -> bool:
         """Whether a line among the samples is a header of other columns, with the same clock."""
         row, own = self.cells(text), self.cells(self.title)
-        return len(row) == len(own) > 1 and row[0] == own[0] != "" and self.is_chatter(text)
+        same = len(row) == len(own) > 1 and row[0] == own[0] and "=" not in text
+        return same and self.is_chatter(text)
 
     def is_remark(self, text: str) -> bool:
         """Whether a line begins with a word, where samples begin with a number or a time."""
