@@ -165,6 +165,7 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
     row = names(index, delimiter) if index >= 0 else []
     listed = _listed(lines[:first])
     unnamed = sum(bool(re.search(r"\w", name)) for name in row) < width
+    unnamed |= index >= 0 and _LISTED.match(lines[index].text) is not None
     if unnamed and len(listed) == width > 1 and {*columns} <= {*listed}:
         check_columns(listed, columns, "the list of columns")
         return Header(first - 1, mark, listed)

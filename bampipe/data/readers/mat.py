@@ -114,7 +114,7 @@ def _called(found: dict[str, np.ndarray | str | None]) -> tuple[dict[str, Stored
         # Of several clocks in a struct X, the signals in Y say which is theirs, as dSPACE has it.
         owner, number = label.rpartition(".")[0], found.get(f"{label.removesuffix('Data')}XIndex")
         if isinstance(number, np.ndarray) and number.size == 1:
-            clock = f"{owner.rpartition('Y[')[0]}X[{int(number.item()) - 1}].Data"
+            clock = f"{owner.rpartition('Y[')[0]}X[{number.item() - 1:.0f}].Data"
             if isinstance(times := found.get(clock), np.ndarray):
                 arrays[name.removeprefix(root) + TIME] = stored(times)
     return arrays, root
