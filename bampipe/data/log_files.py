@@ -156,7 +156,10 @@ class LogFiles:
         renamed = {name: own for name, own in pairs.items() if own}
         for name in self.found.keys() - {*names, *renamed}:
             lacking = [c for c in stated if c in common - self.found[name].keys()]
-            self._leave_out([name], f"{_OTHER}, without {join_names(lacking, 3)}")
+            why = f"{_OTHER}, without {join_names(lacking, 3)}"
+            if [*self.found[name]] == [f"column_{n}" for n, _ in enumerate(stated, 1)]:
+                why = f"no header; to read it like {names[0]}: --names {','.join(stated)}"
+            self._leave_out([name], why)
         trials = [TrialEntry(file=n, kind="free") for n in names]
         trials += [TrialEntry(file=n, kind="free", columns=own) for n, own in renamed.items()]
         return trials, [c for c in stated if c in common]

@@ -64,6 +64,7 @@ def read_recording(
             datetimes={time: clock.format} if unit == "datetime" and time else {},
             dialect=dialect,
         )
+        raw = _forwards(raw, time) if unit == "datetime" else raw
         called = {bare: column for column, (part, bare) in places.items() if part == name}
         return replace(
             raw,
@@ -98,6 +99,21 @@ def read_recording(
         ).between(start, stop)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
     return _at_one_rate(_without_codes(_filled(_one_of(raw, entry, clock), clock), clock), clock)
+
+
+def _forwards(raw: RawTrial, time: str) -> RawTrial:
+    """The rows in the order of their ``time``, where a data base gave the newest first.
+
+    It is one of dates and times: a number may count down.
+    """
+    t = raw.columns.get(time, np.empty(0))
+    if len(t) < 2 or not np.all(np.diff(t) < 0.0):
+        return raw
+    columns = {name: values[::-1] for name, values in raw.columns.items()}
+    columns[time] = columns[time] - t[-1]
+    since = {name: first + round(t[-1] * NANOSECONDS) for name, first in raw.since.items()}
+    notes = (*raw.notes, "the newest row stands first: all are turned round")
+    return replace(raw, columns=columns, rows=raw.rows[::-1], since=since, notes=notes)
 
 
 def _without_codes(raw: RawTrial, clock: Clock) -> RawTrial:

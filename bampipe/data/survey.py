@@ -24,6 +24,8 @@ from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 
+_ON_CIRCLE = 0.01
+"""Largest deviation of two readings from a cosine and a sine."""
 _RISES = 0.8
 """Share of samples at which a clock rises, if what else it does is an accident."""
 
@@ -131,7 +133,8 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
             logs.passed.append((trial.file, str(error)))
     if not read:
         raise logs.fault()
-    columns, guessed = _by_looks(_with_commands(list(read)), folder)
+    known, said = _of_angles(read)
+    columns, guessed = _by_looks(_with_commands(known), folder)
     # The first unit of a quantity is that of the first column which looks like it.
     units = [(x, u) for x, u in reversed(beside.items()) if unit(u) is not None]
     of: dict[str, Any] = {role_of(x, u): {"quantity": x, "unit": u} for x, u in units}
@@ -141,7 +144,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     )
     if logs.episodes is not None:
         logs.remarks = [VOCABULARY["remarks"]["lerobot"]]
-    remarks, timed = (*logs.remarks, *guessed), any(c.role == "time" for c in columns)
+    remarks, timed = (*logs.remarks, *said, *guessed), any(c.role == "time" for c in columns)
     stated = {} if timed else intervals_stated(folder, {trial.file for trial in sound})
     return Survey(tuple(sound), columns, remarks, tuple(logs.passed), stated)
 
@@ -176,13 +179,20 @@ def _read(
         if end[one] == end[other] and step and np.nanmax(np.abs(here - there)) > step:
             raise refusal("own_times", trial.file, one=one, other=other)
     found = []
+    # Elsewhere, _in may be an input.
+    imperial = any(re.search(r"(\b|_)(lbs?|lbf|kip|psi)\b", f"{c} {labels[c]}") for c in ordered)
     for column in ordered:
         said = raw.units.get(column, labels[column])
         role = role_of(column, said)
         if role and clock.column != column and re.search(r":column_\d+$|\[0\]$", column):
             # A column without a header, or of a matrix, may be named after the others.
             role = "time" if is_time(raw.columns[column][sound]) else role
+        # The number of a message is named by its topic, like the readings beside it.
+        if role not in ("time", "reference") and _is_count(raw.columns[column]):
+            role = ""
         unit = unit_of(column, said, role)
+        if imperial and role == "position" and column.endswith("_in"):
+            unit = unit or "in"
         factor = FACTOR.search(column)
         if unit and factor and factor[0] not in unit:
             unit = said = f"{unit}, {factor[0].strip('_. (')}"
@@ -210,6 +220,12 @@ def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
     kept = [mask for mask in known if 2 * mask.sum() > len(mask)]
     complete = np.logical_and.reduce(kept) if kept else np.ones(len(known[0]), dtype=bool)
     return complete if 2 * complete.sum() > len(complete) else np.ones_like(complete)
+
+
+def _is_count(values: np.ndarray) -> bool:
+    """Whether values (T,) rise by the same step from each row to the next."""
+    steps = np.diff(values)
+    return len(steps) > 3 and bool(np.ptp(steps) < 1e-6 * np.min(steps))
 
 
 def _by_looks(
@@ -243,6 +259,17 @@ def _by_looks(
     return tuple(
         replace(c, role=roles[c.name], by_looks=True) if c.name in roles else c for c in columns
     ), [guessed]
+
+
+def _of_angles(columns: Sequence[SurveyedColumn]) -> tuple[list[SurveyedColumn], list[str]]:
+    """The columns, cosines and sines of one angle without a role, and these in words."""
+    within = [c for c in columns if re.search("(?i)cos|sin", c.name) and not c.is_constant]
+    off = [(x, y, np.hypot(x.values, y.values) - 1.0) for x, y in combinations(within, 2)]
+    pairs = [(x.name, y.name) for x, y, each in off if np.max(np.abs(each)) < _ON_CIRCLE]
+    said = VOCABULARY["remarks"]["circle"]
+    parts = {name for pair in pairs for name in pair}
+    plain = [replace(c, role="") if c.name in parts else c for c in columns]
+    return plain, [said.format(one=one, other=other) for one, other in pairs]
 
 
 def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:

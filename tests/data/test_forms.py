@@ -62,6 +62,40 @@ def test_texts_that_are_no_plain_tables(tmp_path: Path, name: str):
         np.testing.assert_allclose(trial.columns[column][known], values[known], atol=1e-9)
 
 
+def test_stamps_of_which_a_part_is_not_padded_or_counts_days(tmp_path: Path):
+    path, ms = tmp_path / "a.csv", np.arange(60) * 35
+    path.write_text("t,q\n" + "".join(f"{n // 1000}.{n % 1000},{n}\n" for n in ms))
+    np.testing.assert_allclose(read_trial(path, ("t",)).columns["t"], ms / 1000.0)
+    path.write_text("t,q\n" + "".join(f"123:23:59:{n / 1000.0 + 20:06.3f},{n}\n" for n in ms))
+    trial = read_trial(path, ("t",), datetimes={"t": ""})
+    np.testing.assert_allclose(trial.columns["t"], ms / 1000.0)
+
+
+def test_objects_of_json_stand_behind_one_another_and_say_their_types(tmp_path: Path):
+    objects = ({"_id": {"$oid": f"a{n}"}, "n": {"$numberLong": str(n)}, "q": n} for n in range(9))
+    path = tmp_path / "a.json"
+    path.write_text("\n".join(json.dumps(each, indent=1) for each in objects))
+    assert columns_of(path) == {"n": "", "q": ""}
+    np.testing.assert_array_equal(read_trial(path, ("n",)).columns["n"], np.arange(9))
+
+
+def test_formulas_without_results_are_refused(tmp_path: Path):
+    book = pytest.importorskip("openpyxl").Workbook()
+    for row in (("t", "u", "force"), *((n, n, f"=B{n}*50") for n in range(2, 9))):
+        book.active.append(row)
+    book.save(tmp_path / "a.xlsx")
+    with pytest.raises(InputError, match="column 'force': formulas without their results"):
+        columns_of(tmp_path / "a.xlsx")
+
+
+def test_the_numbers_of_messages_are_no_positions(tmp_path: Path):
+    rows, t = np.arange(600.0), np.arange(600) / 100.0
+    write(tmp_path / "1_joint_states.csv", "seq,stamp,q", rows, t, np.sin(5 * t))
+    write(tmp_path / "1_wrench.csv", "seq,stamp,torque.x", 4 * rows, t, np.cos(4 * t))
+    found = {column.name: column.role for column in survey(tmp_path).columns}
+    assert found["joint_states:seq"] == found["wrench:seq"] == ""
+
+
 def test_units_of_properties_are_heard(tmp_path: Path):
     path = tmp_path / "a.csv"
     rate = lines(";{t:.3f};{q:.4f};{u:.4f}", "Name:;t;q;u\nUnit:;s;°;Nm\nRate:;9 Hz;9 Hz;9 Hz\n")
@@ -446,6 +480,9 @@ def test_speeds_in_hertz_commands_and_one_reading_in_two_units(tmp_path):
     names = "time [s],commanded angle [rad],a1 position [rad],c1 position [rev],a1 torque [Nm]"
     write(tmp_path / "b/b.csv", names, T, np.roll(Q, -3), Q, Q / TURN, U)
     assert 'column = "a1 position [rad]"' in propose(tmp_path / "b").session
+    for drive, length in (("load_lbf", "in"), ("load_N", "m")):
+        write(tmp_path / "e/a.csv", f"t [s],stroke_in,{drive}", T, Q, U)
+        assert f'column = "stroke_in", unit = "{length}"' in propose(tmp_path / "e").session
     (tmp_path / "d").mkdir()
     table = np.c_[T, Q, U, 3.0 * U].tolist()
     rows = {"force units": "kip", "displacement units": "in", "data": table}

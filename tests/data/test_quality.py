@@ -101,12 +101,14 @@ def test_turns_wraps_and_missing_samples():
     assert "wraps at a full turn 2 times" in wrapped.repairs[0]
     np.testing.assert_allclose(wrapped.columns["q_turn"], table["turn"], atol=1e-9)
     table = columns()
-    table["yaw"] = np.mod(table["yaw"] + 2**15, 2**16)
+    table["yaw"] = np.mod(table["yaw"], 2**16)
     table["yaw"][[0, 375, 376, 1000]] = np.nan
-    trial = cleaned(table)
-    assert "1 row with missing samples at the ends dropped" in trial.repairs
-    assert "column 'yaw': 3 missing samples interpolated" in trial.repairs
-    assert np.abs(np.diff(trial.columns["q_yaw"])).max() < 0.01
+    in_steps = TABLE["encoders"] | {"yaw": {"column": "yaw", "unit": "0.05mrad"}}
+    for session in (SESSION, session_from({**TABLE, "encoders": in_steps}, Path())):
+        trial = cleaned(table, session=session)
+        assert "1 row with missing samples at the ends dropped" in trial.repairs
+        assert "column 'yaw': 3 missing samples interpolated" in trial.repairs
+        assert np.abs(np.diff(trial.columns["q_yaw"])).max() < 0.01
     table = columns(500)
     assert len(cleaned(table).t) == 500
     with pytest.raises(InputError, match=r"499 samples over 0\.998 s, less than 1 s"):

@@ -599,3 +599,14 @@ def test_what_nothing_tells_of_counts_currents_and_shares_is_asked_once(tmp_path
     assert counts.startswith("counts_per_unit of shoulder and elbow, the counts in one rad")
     with pytest.raises(InputError, match=r'torque_constant: found "\?"'):
         registry.device_from(read_device_file(tmp_path / "device.toml"))
+
+
+def test_joints_called_otherwise_are_in_order_unless_a_name_contradicts(tmp_path: Path):
+    table = write_log(tmp_path)
+    for first, last, fits in (("base", "elbow", True), ("elbow", "tip", False)):
+        ends = ("pos_rad", "torque_Nm", "acc")
+        table.columns = ["time_s", *(f"{j}_{x}" for x in ends for j in (first, last))]
+        table.to_parquet(tmp_path / "log.parquet")
+        proposed = propose(tmp_path)
+        assert "are taken in the order of their columns" in " ".join(proposed.check) or not fits
+        assert bool(proposed.fill_in) is not fits

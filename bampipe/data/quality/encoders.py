@@ -43,11 +43,13 @@ def integrate(table: TrialTable, encoder: Encoder) -> None:
 
 def unwrap(table: TrialTable, encoder: Encoder) -> None:
     """Undo the wrap-around of a counter, or of an angle at a full turn."""
-    if encoder.integrate or (encoder.unit == "m" and not encoder.counts):
+    values = table.columns[encoder.column]
+    # A counter in steps of its unit, such as 0.01 mm, has bits, too.
+    counts = encoder.counts or np.array_equal(values, np.rint(values), equal_nan=True)
+    if encoder.integrate or (encoder.unit == "m" and not counts):
         return
     turn = 2 * np.pi / abs(encoder.raw_scale) if encoder.unit == "rad" else 0.0
-    values = table.columns[encoder.column]
-    found, rows, words = unwrapped(values, turn, encoder.counts, encoder.zero)
+    found, rows, words = unwrapped(values, turn, counts, encoder.zero)
     if len(rows):
         table.columns[encoder.column] = found
         spans = [float(np.nanmax(x) - np.nanmin(x)) for x in (found, values)]

@@ -367,6 +367,11 @@ class ArrayReader:
     def columns(self, path: Path) -> dict[str, str]:
         """Names and units of the columns that were recorded together; see `columns_of_arrays`."""
         with self.opened(path, None) as (arrays, _):
+            shapes = {x: a.shape for x, a in arrays.items() if a.kind in _NUMBERS}
+            sampled = [x for x, shape in shapes.items() if math.prod(shape) > LARGEST_WIDTH]
+            blocks = [x for x in sampled if not labels("", shapes[x])]
+            if blocks and len(blocks) == len(sampled):
+                raise refusal("block", name=blocks[0], shape=_by(shapes[blocks[0]]))
             return columns_of_arrays(arrays)
 
 
@@ -383,12 +388,6 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     for key, array in whole.items():
         parts = _fields(key, array)
         found |= {n: stored(np.atleast_1d(x), units.get(n, "")) for n, x in parts}
-    sampled = [array.shape for array in found.values() if math.prod(array.shape) > LARGEST_WIDTH]
-    blocks = [
-        (name, array.shape) for name, array in found.items() if len(labels("", array.shape)) == 0
-    ]
-    if wanted is None and blocks and len(blocks) == len(sampled):
-        raise refusal("block", name=blocks[0][0], shape=_by(blocks[0][1]))
     yield found, ()
 
 

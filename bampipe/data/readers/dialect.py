@@ -63,6 +63,12 @@ class TableLayout:
         plain = text.removeprefix("\ufeff")  # of a file that was appended
         return bool(self.title) and self.cells(plain) == self.cells(self.title)
 
+    def begins_another(self, text: str) -> bool:
+        """Whether a line among the samples is a header of other columns, with the same clock."""
+        row, own = self.cells(text), self.cells(self.title)
+        same = len(row) == len(own) > 1 and row[0] == own[0] and "=" not in text
+        return same and self.is_chatter(text)
+
     def is_remark(self, text: str) -> bool:
         """Whether a line begins with a word, where samples begin with a number or a time."""
         return heads.is_remark(text) or _WORD.match(next(iter(self.cells(text)), "")) is not None

@@ -22,7 +22,7 @@ NULLS = ("", "nan", "NaN", "NAN", "NA", "N/A", "n/a", "#N/A", "null", "NULL", "N
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
 POINT = re.compile(rf"{NUMBER}\Z")
 _COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
-_REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?")
+_REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?((?i:columns|fields): +(?=\w+ ?[\[(,]))?")
 _BYTE_ORDER = b"\xef\xbb\xbf"
 _PROPERTY = re.compile(r"\A[A-Za-z ]+:\s+(?=\S)")
 """Key before what a cell says of a channel: ``Type: double``."""
@@ -164,10 +164,15 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
     row = names(index, delimiter) if index >= 0 else []
     listed = _listed(lines[:first])
     unnamed = sum(bool(re.search(r"\w", name)) for name in row) < width
+    unnamed |= index >= 0 and _LISTED.match(lines[index].text) is not None
     if unnamed and len(listed) == width > 1 and {*columns} <= {*listed}:
         check_columns(listed, columns, "the list of columns")
         return Header(first - 1, mark, listed)
     if index < 0:
+        above = cells(lines[first - 1].text, mark) if 0 < first < len(lines) else []
+        if mark == "," and 2 * len(above) == width and "." not in lines[first].text:
+            place, known = f"row {lines[first].number}", {"actual": width, "expected": len(above)}
+            raise refusal("torn_at_decimals", place, **known)
         row = [f"{_NUMBERED}{n}" for n, _ in enumerate(samples, 1)]
         if set(columns) <= set(row):
             return Header(first - 1, mark, row)
@@ -278,8 +283,8 @@ def _fitted(row: list[str], text: str, width: int) -> list[str]:
 
 
 def _counted(name: str) -> list[str]:
-    """The names of as many columns as a name says behind it: ``q[2]`` is q[0] and q[1]."""
-    match = re.fullmatch(r"(\S+)\[(\d{1,2})\]", name)
+    """The names of as many columns as a name says behind it: ``q[2]``, ``q(1:2)``."""
+    match = re.fullmatch(r"(\S+)[\[(](?:1:)?(\d{1,2})[\])]", name)
     return [f"{match[1]}[{k}]" for k in range(int(match[2]))] if match else [name]
 
 
@@ -308,7 +313,19 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
     first = [cells(text, delimiter)[0] for text in rows] if unnamed else []
     if first and all("." in x or is_moment(x) for x in first):
         row[0] = "index" if "time" in row else "time"  # of a frame of pandas; R numbers its rows
-    return _told_apart(row, beside)
+    return _told_apart(_spread(row, rows[0] if rows else "", delimiter), beside)
+
+
+def _spread(header: list[str], below: str, delimiter: str) -> list[str]:
+    """The header with ``q[0]``, ``q[1]`` where names stand over the first of as many columns."""
+    starts = [n for n, name in enumerate(header) if name]
+    spans = [(a, b) for a, b in pairwise([*starts, len(header)]) if b > a + 1]
+    samples = cells(below, delimiter)
+    filled = all(map(POINT.match, samples)) and len(samples) == len(header)
+    if len(spans) > 1 and len({b - a for a, b in spans}) == 1 and filled:
+        for a, b in spans:
+            header = [*header[:a], *(f"{header[a]}[{k}]" for k in range(b - a)), *header[b:]]
+    return header
 
 
 def _is_key_of_names(row: list[str]) -> bool:

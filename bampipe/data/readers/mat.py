@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import hdf5
-from bampipe.data.readers.arrays import ArrayReader, Opened, Stored, called_signals, stored
+from bampipe.data.readers.arrays import TIME, ArrayReader, Opened, Stored, called_signals, stored
 from bampipe.data.readers.trial import Wanted
 from bampipe.data.refusals import refusal
 
@@ -111,6 +111,12 @@ def _called(found: dict[str, np.ndarray | str | None]) -> tuple[dict[str, Stored
         value = found[label]
         array = None if isinstance(value, str) else value
         arrays[name.removeprefix(root)] = stored(array, unit)
+        # Of several clocks in a struct X, the signals in Y say which is theirs, as dSPACE has it.
+        owner, number = label.rpartition(".")[0], found.get(f"{label.removesuffix('Data')}XIndex")
+        if isinstance(number, np.ndarray) and number.size == 1:
+            clock = f"{owner.rpartition('Y[')[0]}X[{number.item() - 1:.0f}].Data"
+            if isinstance(times := found.get(clock), np.ndarray):
+                arrays[name.removeprefix(root) + TIME] = stored(times)
     return arrays, root
 
 

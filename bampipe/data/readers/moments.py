@@ -16,9 +16,10 @@ _DAY = 86_400 * NANOSECONDS
 _MOMENT = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?\s*\Z")
 """ISO 8601 date and time."""
 _OF_DAY = re.compile(
-    r"\s*(?:\d+ days )?(?:\d{1,2}:\d\d:\d\d(?:[.,]\d+|[:;]\d{3})?|\d{1,2}:\d\d[.,]\d+)\s*\Z"
+    r"\s*(?:\d+ days |\d{3}:(?=\d\d:\d\d:))?"
+    r"(?:\d{1,2}:\d\d:\d\d(?:[.,]\d+|[:;]\d{3})?|\d{1,2}:\d\d[.,]\d+)\s*\Z"
 )
-"""Time of day, of a stop watch, and since the first sample, as pandas writes it."""
+"""Time of day, of a stop watch, since the first sample as in pandas, of a day of the year."""
 _LOCAL = re.compile(
     r"\s*(?:(?P<a>\d{1,2})(?P<sep>[./-])(?P<b>\d{1,2}|[A-Z][a-z]{2})(?P=sep)(?P<year>\d{4})[T ]+)?"
     r"(?P<hour>\d{1,2})(?P<rest>:\d\d(?::\d\d(?:[.,:]\d+)?)?)(?P<half> ?[AaPp]\.?[Mm]\.?)?\s*\Z"
@@ -57,6 +58,7 @@ def nanoseconds(values: Sequence[str | None] | np.ndarray, form: str, row: int =
         of_day = plain.str.match(_OF_DAY).fillna(False)
         clock = plain.str.replace(r"^(\d\d?:\d\d:\d\d)[:;]", r"\1.", regex=True)
         clock = clock.str.replace(r"^(\d\d?:\d\d\.)", r"0:\1", regex=True)
+        clock = clock.str.replace(r"^(\d{3}):", r"\1 days ", regex=True)
         since = pd.to_timedelta(clock.where(of_day), errors="coerce")
         plain = plain.mask(of_day, (pd.Timestamp(0) + since).astype("string"))
     try:

@@ -6,6 +6,7 @@ as many names stands beside them, they have these.
 """
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -89,19 +90,9 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
             text = stream.read().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError("not UTF-8 text", remedy="save it as UTF-8") from error
-    notes: tuple[str, ...] = ()
-    content: object = None
-    if {".jsonl", ".ndjson"} & {suffix.lower() for suffix in path.suffixes[-2:]}:
-        lines = [line for line in text.splitlines() if line.strip()]
-        content = parsed = [_parsed(x, f"sample {n}") for n, x in enumerate(lines[:-1], 1)]
-        try:
-            parsed += [_parsed(x, f"sample {len(lines)}") for x in lines[-1:]]
-        except InputError:
-            if text.endswith("\n"):
-                raise
-            notes = ("last line is cut off: 1 row dropped",)
-    else:
-        content = _with_lists(_parsed(text))
+    one_a_line = bool({".jsonl", ".ndjson"} & {suffix.lower() for suffix in path.suffixes[-2:]})
+    parsed, notes = _parsed(text, one_a_line)
+    content = parsed if one_a_line or len(parsed) > 1 else _with_lists(parsed[0])
     items = content.items() if isinstance(content, dict) else [("", content)]
     lists = {str(k): v for k, v in items if isinstance(v, list) and v and isinstance(v[0], dict)}
     # Objects are samples rather than recordings or channels: lists in or beside these are longer.
@@ -134,7 +125,9 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
             raise InputError("not an object with named values", where=f"sample {number}")
     # Records of several kinds may stand in turn.
     first = [cell for sample in samples[:_TRIED] for cell in leaves(sample)]
-    named = [x for x, cell in first if reads_as_number(cell) or _is_moment(cell)]
+    filled = Counter(x for x, cell in first if cell is not None)
+    read = Counter(x for x, cell in first if reads_as_number(cell) or _is_moment(cell))
+    named = [x for x, count in read.items() if 2 * count > filled[x]]  # no digits of an identifier
     asked = wanted.columns if wanted else ()
     named += [x for x in asked if any(find(s, x) is not MISSING for s in samples[:_TRIED])]
     found = {name: _column(samples, name, units) for name in dict.fromkeys(named)}
@@ -174,9 +167,25 @@ def _is_moment(cell: object) -> bool:
     return isinstance(cell, str) and moments.is_moment(cell)
 
 
-def _parsed(text: str, where: str = "") -> object:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        line = f" at line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
-        raise refusal("no_json", where, line=line) from error
+def _parsed(text: str, one_a_line: bool) -> tuple[list[object], tuple[str, ...]]:
+    """The values that stand one behind the other in a text, at least one, and a note on the end."""
+    decoder, parsed = json.JSONDecoder(object_hook=_plain), list[object]()
+    text, at = text.lstrip(), 0
+    while not parsed or at < len(text):
+        try:
+            value, end = decoder.raw_decode(text, at)
+        except (ValueError, RecursionError) as error:
+            if one_a_line and parsed and "\n" not in text[at:]:
+                return parsed, ("last line is cut off: 1 row dropped",)
+            where = f"sample {len(parsed) + 1}" if one_a_line else ""
+            line = f" at line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
+            raise refusal("no_json", where, line=line) from error
+        parsed.append(value)
+        at = next((n for n in range(end, len(text)) if not text[n].isspace()), len(text))
+    return parsed, ()
+
+
+def _plain(found: dict[str, object]) -> object:
+    """The value of an object that says its type, as MongoDB writes: ``{"$numberLong": "1"}``."""
+    key, value = next(iter(found.items()), ("", None))
+    return value if len(found) == 1 and key[:1] == "$" else found

@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import count, pairwise
+from itertools import count, pairwise, zip_longest
 from typing import Any
 
 from bampipe.data.readers.heads import cells
@@ -29,6 +29,7 @@ _STAMPED = re.compile(
 _LINE_PROTOCOL = re.compile(r"[^\s,=]+(?:,\S+)? (\w[^\s=]*=\S+) (\d{10,19})\s*")
 _ELEMENT = re.compile(r"<(\w+)((?:\s+\w+=\"[^\"]*\")+)\s*/?>|<(\w+)>([^<>]*)</")
 _WITH_UNIT = re.compile(rf"({NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
+_UNPADDED = re.compile(r"(-?\d+)\.(\d+)")
 _FORTRAN = re.compile(r"(\d\.?\d*)[Dd]([-+]\d)")
 _HEX = re.compile(r"(?i)(?<![\w.])0x[0-9a-f]{1,8}(?!\w)")
 _NAMES = re.compile(r"(?i)(?:channel|signal|marker)_names?[\t;,]")
@@ -121,11 +122,12 @@ def find_form(head: str) -> Form | None:
         return Form(said, lambda line: inner.rewrite(line.translate(plain)), inner.names)
     if found := _of_program(head, whole):
         return found
-    ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
+    ended = [line for line in lines if re.search(r"^[^;]*[\w.] *;( *\.\.\.)?$", line)]
     apart = all(re.search(r"[,\t |]", line) for line in ended)
     of_matrix = re.fullmatch(r"[^\[]*\]\s*;?\s*", lines[-1])  # of MATLAB
     if of_matrix or (2 * len(ended) > len(lines) and apart):
-        return Form("", lambda line: re.sub(r"^\s*\[|[\s;]*\]?[\s;]*$", "", line))
+        ends = re.compile(r"^\s*(\w+ *= *)?\[|[\s;]*((?<![^\W\d_])\])?[\s;]*(\.\.\.)?$")
+        return Form("", lambda line: ends.sub("", line))
     if _are(_STAMPED, lines):
         return _stamped(lines)
     for kind, form in _ALIKE.items():
@@ -269,10 +271,14 @@ def _pairs(lines: Sequence[str], find: Callable[[str], list[tuple[str, str]]]) -
 
 def _cells(header: list[str], rows: list[list[str]], delimiter: str) -> Form | None:
     """The form of a table whose cells are more than numbers."""
-    units, widths = [], []
-    for column in zip(*rows, strict=True):
+    units, widths, digits = [], [], []
+    columns = [*zip(*rows, strict=True)]
+    for column, title, beside in zip_longest(columns, header[1:], columns[1:], fillvalue=""):
+        digits.append(_digits(column))
         ends = Counter(match[2] for cell in column if (match := _WITH_UNIT.fullmatch(cell)))
         end, count = ends.most_common(1)[0] if ends else ("", 0)
+        if re.match(r"(?i)units?\b|einheit", title):
+            end, count = Counter(beside).most_common(1)[0]
         units.append(end if count > _MOST * len(rows) and unit(end) else "")
         width, count = Counter(len(_items(cell)) for cell in column).most_common(1)[0]
         widths.append(width if count > _MOST * len(rows) else 0)
@@ -282,6 +288,9 @@ def _cells(header: list[str], rows: list[list[str]], delimiter: str) -> Form | N
         return Form(
             "cells that are lists", _by_cell(delimiter, _named_lists(rows, widths), _unpacked)
         )
+    if any(digits):
+        said = "zeros put before the fractions of seconds, which are not padded"
+        return Form(said, _by_cell(delimiter, digits, _padded))
     for at in range(min(2, len(header) - 1)):
         names = Counter(row[at] for row in rows if row != header)
         numbers = sum(all(re.fullmatch(NUMBER, x) for x in row[2:]) for row in rows)
@@ -294,6 +303,22 @@ def _cells(header: list[str], rows: list[list[str]], delimiter: str) -> Form | N
         ):
             return _in_turn(header, list(names), at, delimiter)
     return None
+
+
+def _digits(column: Sequence[str]) -> int:
+    """Digits of a fraction that was printed as a number of its own, 3 of ``12.5`` for 12.005 s.
+
+    Such fractions never begin with a zero, but end in it. 0 of a column of other numbers.
+    """
+    ends = {match[2] for cell in column if (match := _UNPADDED.fullmatch(cell))}
+    longest, shortest = (of(map(len, ends), default=0) for of in (max, min))
+    fits = longest % 3 == 0 and shortest < longest and not any(re.match("0.", x) for x in ends)
+    return longest if fits and any(re.search(".0$", x) for x in ends) else 0
+
+
+def _padded(cell: str, digits: int) -> list[str]:
+    match = _UNPADDED.fullmatch(cell)
+    return [f"{match[1]}.{match[2].zfill(digits)}" if match else cell]
 
 
 def _in_turn(header: list[str], names: list[str], at: int, delimiter: str) -> Form:

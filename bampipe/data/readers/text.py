@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import BinaryIO
 
@@ -142,10 +143,18 @@ def _sheet(file: BinaryIO) -> BinaryIO:
     Sheets that share their first column, such as time, add their other columns to those.
     InputError without openpyxl.
     """
-    book = need("openpyxl", "xlsx").load_workbook(file, read_only=True, data_only=True)
+    load = need("openpyxl", "xlsx").load_workbook
+    book = load(file, read_only=True, data_only=True)
     sheets = [[*sheet.iter_rows(values_only=True)] for sheet in book.worksheets]
     longest = max(sheets, key=len, default=[])
     named = [row for row in longest if sum(isinstance(cell, str) for cell in row) > 1][:1]
+    columns = zip_longest(*longest[longest.index(named[0]) :]) if named else iter(())
+    for n, (name, *column) in enumerate(columns, 1):
+        if name and column.count(None) == len(column) > 0:
+            sheet = load(file, read_only=True).worksheets[sheets.index(longest)]
+            last = sheet.iter_rows(len(longest), len(longest), n, n, values_only=True)
+            if str(next(last)[0]).startswith("="):
+                raise refusal("formulas", f"column '{name}'")
     text = io.StringIO(newline="")
     for rows in sheets if named else [longest]:
         if rows is longest or named[0] in rows:
@@ -274,6 +283,8 @@ def _read_samples(stream: BinaryIO, layout: TableLayout, end: int, samples: _Sam
             again = layout.is_header(line.text)
             samples.rows = rows
             del samples.batches[batches:]
+            if not again and layout.begins_another(line.text):
+                raise refusal("second_table", f"row {line.number}") from error
             if not again and _is_end(stream, line, end, layout):
                 samples.notes.append(f"row {line.number} and what follows are no samples: left out")
                 end = line.start
@@ -407,6 +418,8 @@ def _fault(message: str, layout: TableLayout, line: Line) -> InputError:
             return refusal("torn_at_decimals", where, **known)
         if known["actual"] > known["expected"] and clock:
             return refusal("torn_at_seconds", where, **known, clock=clock[0])
+        if line.number == layout.first_line:
+            return refusal("no_fit", where, **known)
         return refusal("torn", where, **known)
     column, value = layout.header[int(cell[1])], cell[2]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]

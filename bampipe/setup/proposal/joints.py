@@ -131,6 +131,13 @@ def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Gro
         if taken.isdisjoint(column.name for column in group.columns):
             taken |= {column.name for column in group.columns}
             chosen.append(group)
+    if not found and len(columns) == len(names):
+        # In their order, unless the name of a joint stands elsewhere.
+        in_order = dict(zip(names, columns, strict=True))
+        alike = [_named_alike(said, columns, split) for said in (wanted, bare, own)]
+        named = (pair for groups in alike for group in groups.values() for pair in group.items())
+        agree = all(in_order[name] is column for name, column in named)
+        chosen = [Group(tuple(columns), named=False)] * agree
     return chosen
 
 

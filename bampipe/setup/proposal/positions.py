@@ -117,15 +117,26 @@ def signed_readings(found: Survey, notes: Notes) -> tuple[Survey, dict[str, Regi
         copied = next(alike, "") if c.role in DRIVERS and not c.is_constant else ""
         if copied:
             notes.check.append(f"{c.name} repeats {copied} in another unit, and drives nothing")
+        others = (p for p in positions if p is not c and _counts_turns(c.values, p.values))
+        turning = next((p.name for p in others), "")
+        if turning:
+            notes.check.append(f"{c.name} counts the turns of {turning}, which is unwrapped")
         values = registers[c.name].signed(c.values) if c.name in registers else c.values
-        if c.role == "position" and c.name not in registers and c.si != "m":
-            turn = 0.0 if in_counts(c) else 2.0 * np.pi / c.scale
-            values = unwrapped(values, turn, in_counts(c))[0]
+        if c.role == "position" and c.name not in registers and (c.si != "m" or c.is_integer):
+            turn = 0.0 if in_counts(c) or c.si == "m" else 2.0 * np.pi / c.scale
+            values = unwrapped(values, turn, in_counts(c) or c.is_integer)[0]
         if c.role in ("position", *DRIVERS):
             known = np.isfinite(values)
             known[known] = ~find_spikes(values[known], POSITION if c.role == "position" else INPUT)
             if 0 < np.sum(~known) <= _MOST_WILD * len(values):
                 rows = np.arange(len(values))
                 values = np.interp(rows, rows[known], values[known])
-        columns.append(replace(c, values=values, role="reference" if copied else c.role))
+        role = "reference" if copied or turning else c.role
+        columns.append(replace(c, values=values, role=role))
     return replace(found, columns=tuple(columns)), registers
+
+
+def _counts_turns(values: np.ndarray, of: np.ndarray) -> bool:
+    """Whether readings (T,) change just where those ``of`` an encoder (T,) begin a turn anew."""
+    turns = np.abs(np.diff(of)) > 0.5 * np.ptp(of)
+    return bool(turns.any()) and np.array_equal(np.diff(values) != 0.0, turns)

@@ -1,5 +1,6 @@
 """The columns of a robot's log held against its drawing: order, units, signs, sizes, reductions."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -219,6 +220,8 @@ def find_robot_columns(
         if len(groups) > 1:
             listed = "; ".join(map(str, groups[1:]))
             notes.check.append(f"of several {what}, {groups[0]} are taken, not {listed}")
+        if groups and not groups[0].named and not re.search(r"\d", groups[0].columns[0].name):
+            notes.check.append(f"{what} are taken in the order of their columns, {groups[0]}")
     positions, drives = next(iter(by_position), None), next(iter(by_drive), None)
     turns, logged, joints = _turns(device, robot), Logged(device, robot, t), _joints(device)
 
