@@ -257,6 +257,11 @@ def test_the_sheet_with_most_rows_of_a_workbook_is_read(tmp_path):
     np.testing.assert_array_equal(angle, [*range(len(T)), *range(len(T))])
     path.write_bytes(path.read_bytes()[:900])
     assert "not a sound workbook of Excel" in refused(path, ("Time [s]",))
+    book = openpyxl.Workbook()
+    for row in (("t", "u", "force"), *((n, n, f"=B{n}*50") for n in range(2, 9))):
+        book.active.append(row)
+    book.save(path)
+    assert "column 'force': formulas without their results" in refused(path, ("t",))
 
 
 # ROS and MCAP

@@ -71,23 +71,6 @@ def test_stamps_of_which_a_part_is_not_padded_or_counts_days(tmp_path: Path):
     np.testing.assert_allclose(trial.columns["t"], ms / 1000.0)
 
 
-def test_objects_of_json_stand_behind_one_another_and_say_their_types(tmp_path: Path):
-    objects = ({"_id": {"$oid": f"a{n}"}, "n": {"$numberLong": str(n)}, "q": n} for n in range(9))
-    path = tmp_path / "a.json"
-    path.write_text("\n".join(json.dumps(each, indent=1) for each in objects))
-    assert columns_of(path) == {"n": "", "q": ""}
-    np.testing.assert_array_equal(read_trial(path, ("n",)).columns["n"], np.arange(9))
-
-
-def test_formulas_without_results_are_refused(tmp_path: Path):
-    book = pytest.importorskip("openpyxl").Workbook()
-    for row in (("t", "u", "force"), *((n, n, f"=B{n}*50") for n in range(2, 9))):
-        book.active.append(row)
-    book.save(tmp_path / "a.xlsx")
-    with pytest.raises(InputError, match="column 'force': formulas without their results"):
-        columns_of(tmp_path / "a.xlsx")
-
-
 def test_the_numbers_of_messages_are_no_positions(tmp_path: Path):
     rows, t = np.arange(600.0), np.arange(600) / 100.0
     write(tmp_path / "1_joint_states.csv", "seq,stamp,q", rows, t, np.sin(5 * t))
@@ -230,6 +213,10 @@ def test_channels_go_by_the_names_beside_them(tmp_path: Path):
     assert list(columns_of(tmp_path / "d.json")) == ["runs[:].t", "runs[:].u"]
     (tmp_path / "d.json").write_text(json.dumps([{"q": f"{q:.4f}"} for q in Q]))
     np.testing.assert_array_equal(read_trial(tmp_path / "d.json", ("q",)).columns["q"], Q)
+    each = ({"_id": {"$oid": f"a{n}"}, "n": {"$numberLong": str(n)}, "q": n} for n in range(9))
+    (tmp_path / "d.json").write_text("\n".join(json.dumps(one, indent=1) for one in each))
+    assert columns_of(tmp_path / "d.json") == {"n": "", "q": ""}
+    np.testing.assert_array_equal(read_trial(tmp_path / "d.json", ("n",)).columns["n"], range(9))
     heads = np.array(["t", "q", "u"], dtype=object)
     scipy.io.savemat(tmp_path / "g.mat", {"data": np.column_stack([T, Q, U]), "colheaders": heads})
     assert list(columns_of(tmp_path / "g.mat")) == ["data.t", "data.q", "data.u"]
