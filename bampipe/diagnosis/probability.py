@@ -49,12 +49,15 @@ class SetEvidence:
 
 @dataclass(frozen=True)
 class FittedSet:
-    """A set that has been fitted: its log evidence over that of the most probable model, nats.
+    """A set that has been fitted.
 
-    ``rows`` is its residual beyond the bias in units of that model's noise, by axis, each (n,).
+    Attributes:
+        shortfall: log evidence that it gained less than its linear problem promised, nats an
+            independent sample.
+        rows: its residual beyond the bias in units of the present noise, by axis, each (n,).
     """
 
-    gain: float
+    shortfall: float
     rows: Sequence[Array]
 
 
@@ -81,7 +84,6 @@ class Probabilities:
 
 def weigh_sets(
     by_noise: SetCosts,
-    costs: SetCosts,
     fit: Fit,
     pool: Pool,
     fitted: Mapping[tuple[str, ...], FittedSet],
@@ -91,18 +93,19 @@ def weigh_sets(
 ) -> Probabilities:
     """Compute the probabilities of the sets of a pool and of unknown functions beside them.
 
+    The number of independent samples is that of the noise for something unknown, and that of the
+    residual for effects.
+
     Args:
-        by_noise: costs of something unknown beside the most probable model, by the number of
-            samples that are independent in its noise.
-        costs: costs of sets, by the number that are independent in its residual; fit: that model.
-        pool: sets near it, with costs by the noise.
+        by_noise: costs of sets beside the most probable model; fit: that model.
+        pool: sets near it.
         fitted: those that have been fitted, by effects; their evidence is that of the fit.
         given: effects of the model diagnosed, which are not in question.
     """
+    costs = by_noise.with_independent(fit.count_independent(criteria))
     by_fit = {pool[n][1]: one for n, one in fitted.items() if n in pool}
-    none = costs.cost(())
-    # A fit may gain less than its linear problem promised.
-    shortfall = {k: none - costs.cost(k) - s.gain for k, s in by_fit.items()}
+    none, count = costs.cost(()), float(costs.problem.independent.sum())
+    shortfall = {keys: one.shortfall * count for keys, one in by_fit.items()}
     own = [e for e in costs.problem.absence if e not in given]
     bare = change_effects(fit.spec, own)
     weighed = sorted((costs.cost(k) + shortfall.get(k, 0.0), k) for _, k in pool.values() if k)

@@ -168,8 +168,10 @@ def select_effects(
             pool = _explore(search, room, deep=room if number == 0 else min(_MOST_ADDED, room))
             moved, kept = None, dict[tuple[str, ...], FittedSet]()
             last |= number >= _MOST_ROUNDS - 1
-            # Beside something unknown, the residual recurs: fewer of its samples tell sets apart.
-            costs = search.with_independent(current.count_independent(session.criteria))
+            # Where the best set leaves something unknown, its residual recurs: of its samples, only
+            # those that are independent tell whether another fit is worthwhile.
+            left = search.residual_rows(min(pool.values())[1])
+            costs = search.with_independent(current.count_independent(session.criteria, left))
             pool = {name: (costs.cost(keys), keys) for name, (_, keys) in pool.items()}
             none = costs.cost(())
             if not last:
@@ -192,7 +194,7 @@ def select_effects(
                 progress(0.9, "comparing the gains with those on replicates")
                 replicate_gains = search.replicate_gains()
                 probabilities = weigh_sets(
-                    search, costs, current, pool, kept, spec.effects, session.criteria, session.seed
+                    search, current, pool, kept, spec.effects, session.criteria, session.seed
                 )
                 if number < _MOST_ROUNDS:
                     moved = _leave_out(session, search, current, probabilities, spec.effects)
@@ -243,8 +245,9 @@ def _fit_better(
             if gain > _LEAST_GAIN and held_out > -NOTICEABLE:
                 return moved, kept
             rows = zip(moved.rows_beyond_bias, current.likelihood.root, strict=True)
-            least = min(gain, _LEAST_GAIN)
-            kept[effect_names(keys)] = FittedSet(least, [row * root for row, root in rows])
+            short = search.cost(()) - search.cost(keys) - min(gain, _LEAST_GAIN)
+            short /= max(float(search.problem.independent.sum()), 1.0)
+            kept[effect_names(keys)] = FittedSet(short, [row * root for row, root in rows])
         broken.append({*keys})
         if fresh:
             fits[members] = None

@@ -455,11 +455,16 @@ class Fit:
         rows = self.problem.residual_rows(self.solution.base)
         return tuple(left / root for left, root in zip(rows, self.likelihood.root, strict=True))
 
-    def count_independent(self, criteria: Criteria) -> tuple[Samples, ...]:
-        """Return the samples of each axis with the number that are independent in the residual."""
+    def count_independent(
+        self, criteria: Criteria, left: Iterable[Array] = ()
+    ) -> tuple[Samples, ...]:
+        """Return the samples of each axis with the number that are independent in a residual.
+
+        ``left`` is that residual, in units of the noise, by axis, each (n,); by default the fit's.
+        """
         band = self.linearisation.band
         lags = int(criteria.block_s * band.rate_hz / band.step)
-        return self.likelihood.count_independent(self.problem.residual_rows(), lags)
+        return self.likelihood.count_independent(left or self.problem.residual_rows(), lags)
 
     @cached_property
     def held_out_rmse(self) -> Array:
