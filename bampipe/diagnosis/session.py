@@ -311,7 +311,7 @@ class Session:
                     there = -np.inf
                     if not linearisation.factors:
                         rows = linearisation.residual_at(p)
-                        there = problem.cost_of_step(rows, solved.base, count)
+                        there = problem.cost_of_step(rows, step[:count])
                     if there < here:
                         moved = self.linearise(spec, p, linearisation, late_s=late_s)
                         tried = pose_problem(likelihood, moved)

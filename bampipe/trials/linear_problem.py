@@ -296,17 +296,19 @@ class LinearProblem:
         roots = [float(np.mean(np.log(r))) if r.size else 0.0 for r in self.likelihood.root]
         return float(self.independent @ roots) - self.solve().cost
 
-    def cost_of_step(self, residual: Sequence[Array], change: Array, count: int) -> float:
+    def cost_of_step(self, residual: Sequence[Array], steps: Array) -> float:
         """Negative log density after a step, nats; infinite if the residual there is not finite.
 
-        Priors and the scale of the equation are those of the linear problem.
+        Nuisance parameters are fitted anew. Priors and the scale of the equation are those of the
+        linear problem.
 
         Args:
             residual: after the step, by trial, each (K, n_q), N.m or N.
-            change: the step, (P,); its nuisance parameters are fitted anew.
-            count: number of the model's parameters.
+            steps: of the model's parameters, (n,).
         """
-        like = self.likelihood
+        values = dict(enumerate(steps.tolist()))
+        beside = dict.fromkeys(range(len(values), len(self.to_parameters)), 0.0)
+        change, like = self.hold(values | beside)[0], self.likelihood
         weighed = zip(like.samples, like.root, self.base, strict=True)
         y = [
             take_samples(residual, here, axis) * root - base @ change
@@ -314,8 +316,8 @@ class LinearProblem:
         ]
         if not all(np.isfinite(rows).all() for rows in y):
             return np.inf
-        moved, steps = replace(self, y=y), self.to_parameters[:count] @ change
-        return solve_bounded(moved, *moved.sums(), absent=dict(enumerate(steps.tolist()))).cost
+        moved = replace(self, y=y)
+        return solve_bounded(moved, *moved.sums(), absent=values).cost
 
     def solve_nuisance(self, count: int) -> "LinearSolution":
         """The most likely nuisance parameters while the model's ``count`` parameters stay."""

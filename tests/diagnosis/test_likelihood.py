@@ -57,6 +57,16 @@ def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
         assert spread.max() > 1.5 * spread.min()
 
 
+def test_the_cost_of_a_step_is_that_of_the_problem_there(fitted):
+    session, fit = fitted
+    e, p, steps = fit.linearisation, fit.linearisation.p.copy(), -0.02 * fit.linearisation.p
+    p, steps = p + steps, steps[list(e.free)]
+    there = pose_problem(fit.likelihood, session.linearise(fit.spec, p, e))
+    exact = there.solve_nuisance(len(steps)).cost
+    assert fit.problem.cost_of_step(e.residual_at(p), steps) == pytest.approx(exact, abs=0.1)
+    assert exact > fit.solution.cost + 10.0
+
+
 def test_replicates_are_the_same_in_other_processes(fitted):
     session, fit = fitted
     e = fit.linearisation
