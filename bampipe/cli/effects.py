@@ -82,10 +82,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
 
     name, _, target = text.partition(":")
     device = registry.device_from(*read_device(device_name))
-    if name.endswith(".toml"):
-        effect = registry.effect_from(read_effect(name), name)
-    else:
-        effect = registry.effect(name)
+    effect = registry.effect_from(read_effect(name), name)
     targets = effect.targets(device)
     if not targets:
         wanted = "a robot" if effect.robot else "one that can"

@@ -31,7 +31,6 @@ from bampipe.diagnosis.set_cost import added_effects, effect_names, removed_effe
 from bampipe.physics.model_spec import ModelSpec
 from bampipe.results.compare import NOTICEABLE
 from bampipe.trials.likelihood import Likelihood
-from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.samples import take_samples
 
 Progress = Callable[[float, str], None]
@@ -394,8 +393,8 @@ def start_of(search: Search, keys: Sequence[Key], wider: ModelSpec) -> Array:
 
 def _misfit(search: Search, spec: ModelSpec, p: Array) -> float:
     """Return the misfit of the trials at parameters ``p``, (n_p,), nats up to a constant."""
-    e, like, system = search.dictionary.linearisation, search.problem.likelihood, system_of(spec)
-    rows = e.thin(lambda at: ModelOnTrial(system, p, [at.motion]).residual)
+    like = search.problem.likelihood
+    rows = search.dictionary.linearisation.residual_of(system_of(spec), p)
     left = (take_samples(rows, here, axis) for axis, here in enumerate(like.samples))
     cost = float(search.problem.independent @ _log_squares(like, left))
     return cost if np.isfinite(cost) else np.inf

@@ -307,10 +307,11 @@ class Session:
                     is_coarse = 2.0 * np.pi * highest_hz * abs(step[count]) > _COARSE_SHIFT
                     late_s = is_coarse * float(step[count])
                 try:
-                    # The residual without its slopes shows most steps that are too long.
+                    # The residual without its slopes shows most steps that are too long. Factors of
+                    # the measured force would change its unit.
                     there = -np.inf
                     if not linearisation.factors:
-                        rows = linearisation.residual_at(p)
+                        rows = linearisation.residual_of(linearisation.system, p)
                         there = problem.cost_of_step(rows, step[:count])
                     if there < here:
                         moved = self.linearise(spec, p, linearisation, late_s=late_s)

@@ -14,7 +14,7 @@ from scipy import stats
 
 from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.data.store import read_parquet, write_parquet
+from bampipe.data.store import read_parquet, trial_ids, write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.identification import filter_run
@@ -63,8 +63,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     trials = trials[(trials["kind"] == "viscous") & (trials["status"] != "set_aside")]
     path = run.require("filter/kinematics.parquet", "filter")
-    moving = set(read_parquet(path, columns=["trial_id"])["trial_id"].astype(str))
-    trials = trials[trials["trial_id"].astype(str).isin(moving)]
+    trials = trials[trials["trial_id"].astype(str).isin(trial_ids(path))]
     target = f"models/{config.model}/viscous"
     if trials.empty:
         rows = pd.DataFrame(columns=["t_total", "trial_id"])
@@ -88,12 +87,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         motion = read_motion(path, name, system, stretches.get(name, ()), filters)
         motions.append(motion.with_channels({b: np.zeros(motion.t.size) for b in brakes}))
     commanded = trials["viscous_n_s_per_m"].to_numpy(dtype=float)
-    result, frame = _estimated(run, system, motions, commanded, identified, config, progress)
+    result, frame = _estimate_damping(run, system, motions, commanded, identified, config, progress)
     write_parquet(out / f"{target}.parquet", frame)
     return result.write(out)
 
 
-def _estimated(
+def _estimate_damping(
     run: RunFolder,
     system: System,
     motions: Sequence[Motion],
@@ -111,11 +110,11 @@ def _estimated(
     if identified.noise is not None and config.force_noise == 0.0:
         found_sd = [identified.noise.process_sd[name] for name in system.noise]
         settings = settings._replace(noise_sd=np.array(found_sd))
-    brakes = [name in system.model.device.brakes.values() for name in system.inputs]
+    is_brake = [name in system.model.device.brakes.values() for name in system.inputs]
     readings = []
     for motion in motions:
         trial = filter_run.load_filter_trial(run, motion, system, start, settings)
-        readings.append(replace(trial, u=np.where(brakes, 0.0, trial.u)))
+        readings.append(replace(trial, u=np.where(is_brake, 0.0, trial.u)))
     free = [item for item in system.parameters if not item.fixed]
     late_s = identified.input_timing.estimate
     model = filter_run.build_filter_model(system, readings, start, False, late_s)
@@ -123,7 +122,6 @@ def _estimated(
     value = np.array([estimates.get(item.name, command or 0.0) for item in free])
     sd = np.array([known[item.name].sd if item.name in known else item.sd for item in free])
     sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
-
     attempts: list[filter_run.Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
     found = filter_run.follow_trials(
         model,

@@ -95,9 +95,9 @@ class Linearisation:
         rows = (x[part] for at in self.along for x in [of(at)] for part in at.motion.parts)
         return self.band.thin_trials(rows, range(len(self.system.coordinates)))
 
-    def residual_at(self, p: Array) -> list[Array]:
-        """Residual at other parameters (n_p,), by trial, each (K, n_q), N.m or N."""
-        return self.thin(lambda at: ModelOnTrial(self.system, p, [at.motion]).residual)
+    def residual_of(self, system: System, p: Array) -> list[Array]:
+        """Residual of a model with the same coordinates, by trial, each (K, n_q), N.m or N."""
+        return self.thin(lambda at: ModelOnTrial(system, p, [at.motion]).residual)
 
     @cached_property
     def by_timing(self) -> tuple[Array, ...]:
