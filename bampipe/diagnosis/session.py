@@ -36,7 +36,14 @@ from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import NoiseFloor
 from bampipe.trials.replicates import SimulatedTrials, keep_motion, make_replicate
 from bampipe.trials.residuals import ModelOnTrial
-from bampipe.trials.samples import Noise, Samples, describe_noise, lay_out_samples, take_samples
+from bampipe.trials.samples import (
+    BIASES,
+    Noise,
+    Samples,
+    describe_noise,
+    lay_out_samples,
+    take_samples,
+)
 from bampipe.trials.sensors import Sensors
 from bampipe.workers import process_pool
 
@@ -54,6 +61,8 @@ _LEAST_FALL = 0.1
 """Smallest fall of it that a step must bring for another to be taken, nats."""
 _STOPPING_WIDTH = 0.125
 """Factor on the sign width of the replicate that stops; a 32nd gives the same residual."""
+_WIDER = 2.0
+"""Factor on the sign width of friction that comes up more gradually than the model's."""
 _SEED = 7
 """Second number, after the user's seed, in the seeds of replicates."""
 
@@ -199,17 +208,25 @@ class Session:
             found = spread(_replicate_trial, tasks)
             return KeptItems(np.concatenate([next(found) for _ in parts], axis=2) for _ in trials)
 
-    def replicate_stopping(self, spec: ModelSpec, linearisation: Linearisation) -> list[Array]:
-        """Return the residual of a replicate without noise whose friction truly stops, by trial.
+    def replicate_reversals(self, spec: ModelSpec, linearisation: Linearisation) -> list[Array]:
+        """Return residuals of friction that reverses otherwise, by trial, each (K, n_q, 2).
 
-        It is zero where the motion is kept, or if the simulation diverges. Controllers keep a robot
-        on its path, so that there only the width of the sign changes the friction.
+        The first is that of a replicate without noise whose friction truly stops. It is zero where
+        the motion is kept, or if the simulation diverges; controllers keep a robot on its path, so
+        that there only the width of the sign changes the friction. The second is that of friction
+        whose sign is wider.
         """
+        stops = self._replicate_stopping(spec, linearisation)
+        wider = _change_width(linearisation, _WIDER)
+        return [np.stack(both, axis=2) for both in zip(stops, wider, strict=True)]
+
+    def _replicate_stopping(self, spec: ModelSpec, linearisation: Linearisation) -> list[Array]:
+        """Return the first residual of `replicate_reversals`."""
         t, nothing = self.trials, [np.zeros_like(r) for r in linearisation.residual]
         if keep_motion(linearisation.fitted):
             return nothing
         if linearisation.system.model.device.robot is not None:
-            return _narrower_friction(linearisation)
+            return _change_width(linearisation, _STOPPING_WIDTH)
         narrow = system_of(spec.with_sign_widths(_STOPPING_WIDTH))
         kept = ([ModelOnTrial(narrow, linearisation.p, [m])] for m in linearisation.motions)
         if any(map(keep_motion, kept)):
@@ -244,8 +261,8 @@ class Session:
         samples = lay_out_samples(linearisation, c.block_s)
         if noise is None:
             residuals = self.replicate(linearisation, count or c.replicates)
-            stopping = self.replicate_stopping(spec, linearisation)
-            noise = describe_noise(residuals, stopping, linearisation, samples)
+            reversals = self.replicate_reversals(spec, linearisation)
+            noise = describe_noise(residuals, reversals, linearisation, samples)
         force_sd = self.trials.sensors.force_sd
         return Likelihood.of(linearisation, samples, noise, c.bias_error, c.discrepancy, force_sd)
 
@@ -347,9 +364,8 @@ class Session:
         """Fit a model with equal noise for all samples of an axis, without replicates."""
         linearisation = self.linearise(spec, start)
         samples = lay_out_samples(linearisation, self.criteria.block_s)
-        nothing = [np.zeros_like(r) for r in linearisation.residual]
         silent = [np.zeros((*r.shape, 2)) for r in linearisation.residual]
-        noise = describe_noise(silent, nothing, linearisation, samples)
+        noise = describe_noise(silent, silent, linearisation, samples)
         flat = Likelihood.of(linearisation, samples, noise, 0.0, 0.0, self.trials.sensors.force_sd)
         linearisation, problem = self._descend(spec, linearisation, flat)
         return Fit(spec, linearisation, flat, problem)
@@ -410,11 +426,10 @@ class Fit:
 
     @cached_property
     def bias(self) -> tuple[Array, ...]:
-        """The fitted bias, common and stopping, by axis, each (n,)."""
+        """The fitted bias by axis, each (n,)."""
         noise, n_q = self.likelihood.noise, len(self.likelihood.samples)
-        factors = (self.problem.to_parameters @ self.solution.base)[-2 * n_q :]
-        pairs = zip(noise.bias, noise.stopping, factors[:n_q], factors[n_q:], strict=True)
-        return tuple(beta * b + gamma * c for b, c, beta, gamma in pairs)
+        factors = (self.problem.to_parameters @ self.solution.base)[-len(BIASES) * n_q :]
+        return tuple(noise.biases(axis) @ factors[axis::n_q] for axis in range(n_q))
 
     @cached_property
     def noise_floor(self) -> NoiseFloor:
@@ -527,12 +542,12 @@ def _replicate_trial(task: tuple[int, Sequence[Seed]]) -> Array:
     return np.stack([values * e.used[trial] for values in thin], axis=2)
 
 
-def _narrower_friction(linearisation: Linearisation) -> list[Array]:
-    """Return the residual of friction with a narrower sign than the model's, by trial, (K, n_q)."""
+def _change_width(linearisation: Linearisation, factor: float) -> list[Array]:
+    """Return the residual of friction whose sign is wider by a factor, by trial, (K, n_q)."""
     e = linearisation
     width = e.system.sign_widths
     rows = (
-        dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width))
+        dry * (np.tanh(m.qd / (factor * width)) - np.tanh(m.qd / width))
         for dry, m in zip(dry_friction(e), e.motions, strict=True)
     )
     thin = e.band.thin_trials(rows, range(len(width)))

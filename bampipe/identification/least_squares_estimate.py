@@ -36,7 +36,7 @@ from bampipe.trials.linear_problem import solve_bounded
 from bampipe.trials.measured import MeasuredTrials, cut_blocks
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import problem_of, rms
-from bampipe.trials.samples import lay_out_samples, take_samples
+from bampipe.trials.samples import BIASES, lay_out_samples, take_samples
 
 _REPLICATES = 6
 _LACKING = 3.0
@@ -262,7 +262,7 @@ class SquaresFit:
     def bias(self) -> Array:
         """Bias of the parameters due to filters and stopping friction, (n,)."""
         unknowns = self.fit.problem.to_parameters.shape[0]
-        factors = range(unknowns - 2 * len(self._left), unknowns)
+        factors = range(unknowns - len(BIASES) * len(self._left), unknowns)
         return self.respond(self.fit.bias, factors)
 
 

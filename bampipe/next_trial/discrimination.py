@@ -20,7 +20,7 @@ from bampipe.trials.likelihood import Likelihood
 from bampipe.trials.linearisation import Linearisation, linearise_fit
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
-from bampipe.trials.samples import Noise, lay_out_samples, take_samples
+from bampipe.trials.samples import BIASES, Noise, lay_out_samples, take_samples
 
 _SLOPE_STEP = 1e-3
 """Relative step of a parameter for the slope of the residual of its effect."""
@@ -170,7 +170,7 @@ class Comparison:
             at = np.searchsorted(speeds[:-1], take_samples(speed, here, axis))
             variance.append(variances[at])
             classes.append(numbers[at])
-        nothing = tuple(np.zeros_like(b) for b in bias)
+        nothing = tuple(np.zeros((len(b), len(BIASES) - 1)) for b in bias)
         noise = Noise(tuple(bias), tuple(variance), nothing, (), tuple(classes))
         force_sd = self.session.trials.sensors.force_sd
         return seen, Likelihood.of(seen, samples, noise, c.bias_error, c.discrepancy, force_sd)
@@ -205,9 +205,8 @@ class Comparison:
         independent = self.independent_share * [s.independent for s in likelihood.samples]
         for axis, here in enumerate(likelihood.samples):
             x = take_samples(by_trial, here, axis)
-            nuisance = np.zeros((len(x), 2 * n_q))
-            nuisance[:, axis] = likelihood.noise.bias[axis]
-            nuisance[:, n_q + axis] = likelihood.noise.stopping[axis]
+            nuisance = np.zeros((len(x), len(BIASES) * n_q))
+            nuisance[:, axis::n_q] = likelihood.noise.biases(axis)
             joined = np.concatenate([nuisance, x], axis=1)
             targets = [target for target, _ in self._places(joined.shape[1])]
             plain.append(np.sum(joined[:, targets] ** 2, axis=0))
@@ -248,7 +247,7 @@ class Comparison:
         """Prior precisions of the nuisance parameters and of the model's own."""
         e = self.fit.linearisation
         of_timing = [12.0 / (e.timing[1] - e.timing[0]) ** 2] if e.by_timing else []
-        return np.concatenate([np.ones(2 * len(self.scale)), e.precision, of_timing])
+        return np.concatenate([np.ones(len(BIASES) * len(self.scale)), e.precision, of_timing])
 
     def find_remainders(self, total: Sums) -> list[Remainder]:
         """Return the remainder of each alternative after a fit of the model alone."""

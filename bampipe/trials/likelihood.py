@@ -2,16 +2,17 @@
 
 For each sample of an axis that counts, with the symbols of docs/method_residual.md:
 
-    y = f(motion; theta) + beta b + gamma c + e
+    y = f(motion; theta) + beta b + gamma c + eta d + e
     var e ~ s^2 (v(z) + tau^2 (b^2 + g^2 c^2) + h^2 + (delta F)^2), with the tails of Student's t
 
 y is the low-passed residual of the fitted model; b the common bias, the mean of replicates; c the
 stopping bias, the residual of a replicate whose friction truly stops the axis, and g a first guess
-of its factor gamma; v the variance of replicates around b in classes z of speed; h the uncertainty
-of dry friction because the instant of a reversal between two samples is unknown; F the applied
-force; s the scale of the axis, which is fitted. Parameters have priors and bounds, and so have the
-nuisance parameters: beta and gamma of each axis, and the input delay. The density is that of the
-measured force: `scale` gives the change of variables from the residual.
+of its factor gamma; d the bias of a sign twice as wide; v the variance of replicates around b in
+classes z of speed; h the uncertainty of dry friction because the instant of a reversal between two
+samples is unknown; F the applied force; s the scale of the axis, which is fitted. Parameters have
+priors and bounds, and so have the nuisance parameters: beta, gamma and eta of each axis, and the
+input delay. The density is that of the measured force: `scale` gives the change of variables from
+the residual.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

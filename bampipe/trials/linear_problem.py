@@ -14,7 +14,7 @@ from bampipe.physics.parameter import Parameter
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.likelihood import Likelihood
 from bampipe.trials.linearisation import Linearisation
-from bampipe.trials.samples import MOST_BIAS, take_samples
+from bampipe.trials.samples import BIASES, MOST_BIAS, take_samples
 
 NOTHING = 1e-4
 """A parameter whose whole range moves the data by fewer standard deviations has no effect."""
@@ -39,16 +39,15 @@ def pose_problem(likelihood: Likelihood, linearisation: Linearisation) -> "Linea
         ratio = np.array(likelihood.model.factors) / np.array(linearisation.factors)
         weights = [root * by for root, by in zip(weights, ratio, strict=True)]
     timing = linearisation.timing if linearisation.by_timing else ()
-    n = len(linearisation.free) + len(timing[:1])
+    n, n_biases = len(linearisation.free) + len(timing[:1]), len(BIASES) * n_q
 
     def weighted_columns(axis: int) -> Iterator[tuple[slice, Array]]:
         """Yield the columns of all unknowns, (k, n_all), in chunks, since they are large."""
-        bias, stopping, weight = noise.bias[axis], noise.stopping[axis], weights[axis]
+        biases, weight = noise.biases(axis), weights[axis]
         for part, slopes in _stack_chunks(samples[axis].take(linearisation.slopes, axis)):
-            columns = np.zeros((len(slopes), n + 2 * n_q))
+            columns = np.zeros((len(slopes), n + n_biases))
             columns[:, :n] = slopes
-            columns[:, n + axis] = -bias[part]
-            columns[:, n + n_q + axis] = -stopping[part]
+            columns[:, n + axis :: n_q] = -biases[part]
             columns *= weight[part, None]
             yield part, columns
 
@@ -60,11 +59,11 @@ def pose_problem(likelihood: Likelihood, linearisation: Linearisation) -> "Linea
 
     # The standard deviation of a uniform distribution is 0.29 of its width.
     of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
-    n_timing, none = len(of_timing), np.zeros(n_q)
-    precision = np.concatenate([linearisation.precision, of_timing, none + 1.0, none + 1.0])
-    known = np.concatenate([linearisation.known, [sum(timing) / 2] * n_timing, none + 1.0, none])
-    lower = np.concatenate([linearisation.lower, timing[:1], none, none])
-    upper = np.concatenate([linearisation.upper, timing[1:], none + MOST_BIAS, none + MOST_BIAS])
+    delay, none = [sum(timing) / 2] * len(of_timing), np.zeros(n_biases)
+    precision = np.concatenate([linearisation.precision, of_timing, none + 1.0])
+    known = np.concatenate([linearisation.known, delay, np.repeat(BIASES, n_q)])
+    lower = np.concatenate([linearisation.lower, timing[:1], none])
+    upper = np.concatenate([linearisation.upper, timing[1:], none + MOST_BIAS])
     y = [
         take_samples(linearisation.residual, here, axis) * weights[axis]
         for axis, here in enumerate(samples)
@@ -97,7 +96,7 @@ def pose_problem(likelihood: Likelihood, linearisation: Linearisation) -> "Linea
     to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
     loose = vectors[:, ~kept] * per_unit[:, None]
     log_scale, by_parameter = _log_scale_with_filters(likelihood, linearisation, y)
-    by_parameter = np.pad(by_parameter, ((0, 0), (0, 2 * n_q)))
+    by_parameter = np.pad(by_parameter, ((0, 0), (0, n_biases)))
     return LinearProblem(
         likelihood, KeptItems(y), KeptItems(map(combined_columns, range(n_q))),
         to.T @ known_precision @ to, to.T @ moment, log_scale,

@@ -11,8 +11,10 @@ from bampipe.trials.linearisation import Linearisation
 
 _SPEEDS = 12
 """Classes of speed in which the variance of replicates is averaged, finer at low speeds."""
+BIASES = (1.0, 0.0, 0.0)
+"""Expected factors of the common bias, the stopping bias and the bias of a wider sign."""
 MOST_BIAS = 1.5
-"""Upper bound of beta and gamma, the factors of the common and of the stopping bias."""
+"""Upper bound of these factors."""
 
 
 @dataclass(frozen=True)
@@ -66,16 +68,21 @@ class Noise:
     Attributes:
         bias: mean of the replicates at each sample, by axis, each (n,), N.m or N.
         variance: variance of the replicates around it, averaged by speed, each (n,).
-        stopping: stopping bias, of a noise-free replicate whose friction truly stops, each (n,).
+        reversals: stopping bias, of a noise-free replicate whose friction truly stops, and bias of
+            friction whose sign is twice as wide, each (n, 2).
         residuals: by axis, each (replicates, n).
         speed: class of speed of each sample, by axis, each (n,).
     """
 
     bias: Sequence[Array]
     variance: Sequence[Array]
-    stopping: Sequence[Array]
+    reversals: Sequence[Array]
     residuals: Sequence[Array]
     speed: Sequence[Indices]
+
+    def biases(self, axis: int) -> Array:
+        """The common bias, the stopping bias and that of a wider sign, (n, 3), N.m or N."""
+        return np.column_stack([self.bias[axis], self.reversals[axis]])
 
     def variance_of_bias(self, axis: int, y: Array) -> Array:
         """Variance of the biases in a residual ``y`` (n,) for a relative error of one, (n,).
@@ -83,7 +90,7 @@ class Noise:
         Half of it applies at the sample itself, and half is spread over samples of the same speed,
         because no replicate reverses at exactly the right instant.
         """
-        b, c, at = self.bias[axis], self.stopping[axis], self.speed[axis]
+        b, c, at = self.bias[axis], self.reversals[axis][:, 0], self.speed[axis]
         both = np.column_stack([b, c]) / np.sqrt(self.variance[axis] + 1e-300)[:, None]
         target = y / np.sqrt(self.variance[axis] + 1e-300)
         factor = np.linalg.lstsq(both, target, rcond=1e-6)[0][1] if len(y) else 0.0
@@ -94,7 +101,7 @@ class Noise:
 
 def describe_noise(
     residuals: Sequence[Array],
-    stopping: Sequence[Array],
+    reversals: Sequence[Array],
     linearisation: Linearisation,
     samples: Sequence[Samples],
 ) -> Noise:
@@ -102,7 +109,8 @@ def describe_noise(
 
     Args:
         residuals: of the replicates, by trial, each (K, n_q, replicates).
-        stopping: of one whose friction truly stops the axes, by trial, each (K, n_q).
+        reversals: of one whose friction truly stops, and of friction whose sign is twice as wide,
+            by trial, each (K, n_q, 2).
         linearisation: the model on the measured trials; samples: those of it that count.
     """
     thinned = linearisation.band.thinned_rows
@@ -121,5 +129,5 @@ def describe_noise(
         biases.append(left.mean(axis=0))
         variances.append((np.bincount(at, around, minlength=_SPEEDS) / count)[at])
         classes.append(at.astype(np.int8))
-    stops = [take_samples(stopping, here, axis) for axis, here in enumerate(samples)]
-    return Noise(KeptItems(biases), KeptItems(variances), KeptItems(stops), by_axis, classes)
+    turns = [take_samples(reversals, here, axis) for axis, here in enumerate(samples)]
+    return Noise(KeptItems(biases), KeptItems(variances), KeptItems(turns), by_axis, classes)
