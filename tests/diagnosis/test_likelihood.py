@@ -34,8 +34,7 @@ def factors(fit, residual):
     """Of the common bias, of the replicate that stops and of a wider sign, (3, n_q)."""
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
     problem = replace(pose_problem(fit.likelihood, fit.linearisation), y=y)
-    solved = problem.to_parameters @ problem.solve().base
-    return solved[-3 * len(residual) :].reshape(3, -1)
+    return (problem.to_parameters @ problem.solve().base)[-3 * len(residual) :].reshape(3, -1)
 
 
 def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
@@ -53,7 +52,7 @@ def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
         by_speed = [np.median(square[:, speed == k].mean(axis=1)) for k in np.unique(speed)]
         assert 0.6 < min(by_speed) and max(by_speed) < 1.7
         spread = np.sqrt(noise.variance[axis])
-        assert spread.max() > 1.3 * spread.min(), "the noise must differ by speed"
+        assert spread.max() > 1.5 * spread.min()
 
 
 def test_the_cost_of_a_step_is_that_of_the_problem_there(fitted):
