@@ -103,7 +103,8 @@ def residual_and_slopes(problem: Problem, trial: int, p: Array) -> tuple[Array, 
     Slopes that the model does not supply are finite differences, forward, or backward at a bound.
     """
     base = problem.residual(trial, p)
-    slopes = np.empty((*base.shape, problem.free.size))
+    # Each slope is contiguous, since it is written and read alone.
+    slopes = np.empty((problem.free.size, *base.T.shape)).transpose(2, 1, 0)
     given: Sequence[int] = ()
     if problem.slopes is not None:
         given, known = problem.slopes(trial, p)

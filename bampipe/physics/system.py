@@ -312,7 +312,7 @@ class System:
             wanted: numbers of parameters, all in `lasting`.
             q, qd, qdd, u: as in `residual`.
         """
-        results = np.zeros((len(q), len(self.coordinates), len(wanted)))
+        results = np.zeros((len(wanted), len(self.coordinates), len(q))).transpose(2, 1, 0)
         bodies = [(k, self.of_bodies[i]) for k, i in enumerate(wanted) if i in self.of_bodies]
         if len(bodies) < len(wanted):
             column = {i: k for k, i in enumerate(wanted)}
