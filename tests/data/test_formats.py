@@ -183,6 +183,10 @@ def test_a_trial_a_row_of_parquet_and_signals_at_rates_of_their_own(tmp_path):
     trial = read_trial(tmp_path / "a.mat", ("out.q.Time", "out.u.Data"))
     np.testing.assert_allclose(trial.columns["out.u.Data"][:-1], 3.0 * t[:-1])
     assert trial.remarks == ("interpolated linearly at the times of the longest: out.u.Data",)
+    np.savez(tmp_path / "a.npz", t_q=t, q=2.0 * t, t1=t[::2], u=np.c_[3.0 * t[::2], t[::2]].T)
+    assert list(columns_of(tmp_path / "a.npz")) == ["t_q", "q", "u[0]", "u[1]"]
+    trial = read_trial(tmp_path / "a.npz", ("t_q", "q", "u[0]"))
+    np.testing.assert_allclose(trial.columns["u[0]"][:-1], 3.0 * t[:-1])
 
 
 # TDMS

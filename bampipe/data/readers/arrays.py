@@ -34,7 +34,7 @@ _RUN = re.compile(
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
 TIME = "@time"
 """End of the name of the times of a channel that has its own."""
-_CLOCK = re.compile(r"(?i)(?:.*[._/@])?(?:t|\w*time|\w*stamp)\Z")
+_CLOCK = re.compile(r"(?i)(?:.*[._/@])?(?:t|\w*time|\w*stamp)(?:_[a-z]+|\d+)?\Z")
 _SCALE = re.compile(
     rf"(?i)(?:\A|[ _./])(?:{'|'.join(SCALES[:-1])}|scale_?factor|(offset))\Z|[./]gain\Z"
 )
@@ -268,41 +268,57 @@ def _at_one_rate(arrays: Arrays) -> Arrays:
 
     Of groups that each have a time, and one signal or others than the rest; else they are trials.
     """
-    groups: dict[str, dict[str, Stored]] = {}
+    groups: dict[str, dict[str, str]] = {}
     for name, array in arrays.items():
         owner, dot, key = name.rpartition("/" if "/" in name else ".")
         if (stem := name.removesuffix(TIME)) + TIME in arrays:  # a channel with times of its own
             owner, dot, key = stem, "", name.removeprefix(stem)
         sampled = array.kind in _NUMBERS and max(array.shape, default=1) > 1
-        if owner + dot and sampled and not _RUN.fullmatch(name):
-            groups.setdefault(owner + dot, {})[key] = array
-    clocks = {
-        own: key for own, keys in groups.items() if (key := next(filter(_CLOCK.match, keys), ""))
-    }
-    kinds = [frozenset(groups[own]) for own in clocks]
-    alone = [own.rpartition("/")[2] for own in clocks if own + TIME in arrays]
+        if sampled and not _RUN.fullmatch(name):
+            groups.setdefault(owner + dot, {})[key] = name
+    tracks = [track for own in groups.values() for track in _by_clock(own, arrays)]
+    kinds = [frozenset(track) for track in tracks]
+    alone = [own.rpartition("/")[2] for own in groups if own + TIME in arrays]
     trials = len({*kinds}) < len(kinds) and max(map(len, kinds)) > 2
-    if len(clocks) < 2 or trials or len({*alone}) < len(alone):
+    if len(tracks) < 2 or trials or len({*alone}) < len(alone):
         return arrays
-    longest = max(
-        (groups[own][key] for own, key in clocks.items()), key=lambda x: math.prod(x.shape)
-    )
+    clocks = [arrays[next(iter(track.values()))] for track in tracks]
+    longest = max(clocks, key=lambda clock: math.prod(clock.shape))
     found = dict(arrays)
-    for own, key in clocks.items():
-        times = groups[own].pop(key)
-        if times.shape != longest.shape and groups[own]:
-            del found[own + key]
-            for name, array in groups[own].items():
-                width = array.shape[1:] if array.shape != times.shape else longest.shape[1:]
+    for times, track in zip(clocks, tracks, strict=True):
+        clock, *signals = track.values()
+        if times.shape != longest.shape and signals:
+            del found[clock]
+            for name in signals:
+                array = arrays[name]
+                width = math.prod(array.shape) // math.prod(times.shape)
                 load = partial(_resampled, longest, times, array)
-                shape = (*longest.shape[:1], *width)
-                found[own + name] = replace(array, shape=shape, load=load)
+                shape = (math.prod(longest.shape), *([width] if width > 1 else []))
+                found[name] = replace(array, shape=shape, load=load)
     return found
+
+
+def _by_clock(names: dict[str, str], arrays: Arrays) -> list[dict[str, str]]:
+    """The arrays of a group, by key, behind the clock of each; of clocks, that of its length."""
+    length = {key: max(arrays[name].shape) for key, name in names.items()}
+    clocks = {length[key]: key for key, name in reversed(names.items()) if _is_clock(name, arrays)}
+    return [
+        {key: names[key], **{x: name for x, name in names.items() if x != key and length[x] == own}}
+        for own, key in clocks.items()
+    ]
+
+
+def _is_clock(name: str, arrays: Arrays) -> bool:
+    """Whether an array is called a time, and never falls."""
+    called = _CLOCK.match(name) and labels("", arrays[name].shape) == [""]
+    t = arrays[name].load().ravel() if called else np.zeros(0)
+    return len(t) > 1 and bool(np.all(np.diff(t) >= 0) and t[-1] > t[0])
 
 
 def _resampled(at: Stored, times: Stored, values: Stored) -> np.ndarray:
     t, own = (array.load().astype(float).ravel() for array in (at, times))
-    columns = values.load().astype(float).reshape(own.size, -1).T
+    table = values.load().astype(float)
+    columns = (table if len(table) == own.size else table.T).reshape(own.size, -1).T
     return np.column_stack([trial.interpolated(t, own, column) for column in columns])
 
 
