@@ -26,6 +26,7 @@ _REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?((?i:columns|fields): +(?=\w+ ?[\[(,])
 _BYTE_ORDER = b"\xef\xbb\xbf"
 _PROPERTY = re.compile(r"\A[A-Za-z ]+:\s+(?=\S)")
 """Key before what a cell says of a channel: ``Type: double``."""
+_PLAIN_NAME = re.compile(r"[^\W\d][\w./-]*(\s?[\[(].*[\])])?\Z")
 _NUMBERED = "column_"
 _NAME_KEYS = word_set("name_keys")
 _LISTED = re.compile(
@@ -206,6 +207,9 @@ def find_starts(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str
         most = next(filter(None, samples), [])
         first = next((n for n, end in zip(most, most[3:], strict=False) if end - n < 6), -1)
         first = first if first >= 0 else next(iter(most), len(lines))
+        # Settings above the names may look like a sample.
+        named = [n for n, row in enumerate(split[: first + 3]) if _are_names(row, width)]
+        first = named[-1] + 1 if named and named[0] > first else first
         # Rows logged before all sensors had answered are samples with empty cells.
         while 0 < first < len(lines) and _is_sparse(split[first - 1], width):
             first -= 1
@@ -218,6 +222,11 @@ def _is_sparse(row: list[str], width: int) -> bool:
     return len(row) == width > 1 and all(cell in NULLS or count_readings([cell]) for cell in row)
 
 
+def _are_names(row: list[str], width: int) -> bool:
+    """Whether a line holds so many names, and no sentence."""
+    return len(row) == width > 1 and all(map(_PLAIN_NAME.match, row))
+
+
 def _find_above(lines: list[Line], first: int, delimiter: str) -> int:
     """Place of the header above the first sample, -1 where there is none."""
     if first >= len(lines):
@@ -226,15 +235,15 @@ def _find_above(lines: list[Line], first: int, delimiter: str) -> int:
     width = len(sample)
     bare = {n: cells(without_mark(lines[n].text), delimiter) for n in near}
     rows = {n: _fitted(row, lines[n].text, width) for n, row in bare.items()}
-    # Below the names stands nothing with fewer cells: that is what a logger says as it starts.
+    # Below names, unless they are plain, stands nothing with fewer cells: a logger says that first.
     apart = [n for n, row in rows.items() if len(row) < width - 1 and not is_remark(lines[n].text)]
     fitting = [
         n
         for n, row in rows.items()
         if width - 1 <= len(row) <= width
-        and n > max(apart, default=-1)
+        and (n > max(apart, default=-1) or (delimiter != " " and _are_names(row, width)))
         and not all(map(POINT.match, row))
-        and all(any(map(str.isalnum, cell)) for cell in row if cell)
+        and (are_units(row) or all(any(map(str.isalnum, cell)) for cell in row if cell))
     ]
     while len(fitting) > 1 and any(map(_PROPERTY.match, rows[fitting[-1]])):
         fitting.pop()

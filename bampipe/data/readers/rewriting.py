@@ -46,7 +46,7 @@ _TYPESET = {"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2009": " "}
 """Minus and blanks of typesetters."""
 _MOST = 0.8
 """Least share of the first lines that are written alike."""
-_TRIED, _FEWEST, _MOST_SIGNALS = 400, 5, 64
+_TRIED, _FEWEST, _MOST_SIGNALS, _HEAD = 400, 5, 64, 1 << 14
 _DELIMITERS = (";", "\t", ",", "|")
 
 
@@ -75,9 +75,16 @@ _ALIKE = {
 def unbroken(text: str) -> str:
     """The text with a line a sample: no line ends in quoted names, as spreadsheets write them.
 
-    Messages as YAML with ``---`` between them, as ROS prints them, become a table.
+    Messages as YAML with ``---`` between them, as ROS prints them, become a table; others that
+    begin with the same line, such as ``<Rob>`` or ``data {``, stand on a line each.
     """
     text = text.replace("\f", "")
+    lines = [line.strip() for line in text[:_HEAD].splitlines()]
+    begins = Counter(line for line in lines if re.fullmatch(r"<.*>|\w+ *\{", line))
+    begin, count = next(iter(begins.most_common(1)), ("", 0))
+    if count > _FEWEST and all(re.search(r"[^\W\d]|[{}]|\A\Z", line) for line in lines):
+        starts = re.split(rf"(?m)^(?=[ \t]*{re.escape(begin)}[ \t]*$)", text)
+        text = "".join(f"{' '.join(message.split())}\n" for message in starts)
     messages = re.split(r"(?m)^---\s*$", text)
     lines = messages[0].splitlines() if len(messages) > _FEWEST else []
     if lines and all(map(_OF_MESSAGE.match, lines)):
@@ -158,7 +165,7 @@ def find_form(head: str) -> Form | None:
 
 
 def _of_program(head: str, whole: Sequence[str]) -> Form | None:
-    """The form of a text of LabVIEW, AcqKnowledge or Qualisys; None of others."""
+    """The form of a text of LabVIEW, AcqKnowledge, Qualisys or Weka; None of others."""
     if head.startswith("LabVIEW Measurement") and "\nX_Value" in head:
         stated = next((re.split(r"[\t,]", x)[1:] for x in whole if x.startswith("Y_Unit")), [])
         step, samples = re.search(r"\nDelta_X\t([^\t\r\n]+)", head), count()
@@ -181,6 +188,8 @@ def _of_program(head: str, whole: Sequence[str]) -> Form | None:
         channels = [f"{a} [{b}]" for a, b in zip(whole[3:end:2], whole[4:end:2], strict=False)]
         times = [f"time [{x}]" for x in whole[end].split(",") if x and not x.startswith("CH")]
         return Form("names of channels above the table", str, (*times, *channels))
+    if attributes := re.findall(r"(?im)^@attribute\s+(['\"]?)(.+?)\1\s+\S+\s*$", head):
+        return Form("names of attributes above the table", str, tuple(n for _, n in attributes))
     for line in whole[:_TRIED]:
         names = re.split(r"[\t;,]", line)[1:] if _NAMES.match(line) else []
         if names and len(names) == len(re.split(r"[\t;,]", whole[-1].strip())):
@@ -247,12 +256,16 @@ def _elements(line: str) -> list[tuple[str, str]]:
 
 
 def _named(line: str) -> list[tuple[str, str]]:
-    """Numbers behind their names; those of a list are numbered."""
+    """Numbers behind their names; those of a list, or of one name, are numbered."""
     found = []
     for name, number, listed in _PAIR.findall(line):
         items = re.split(r"[,;\s]+", listed)
         found += [(f"{name}[{k}]", x) for k, x in enumerate(items) if x] or [(name, number)]
-    return found
+    names = [name for name, _ in found]
+    return [
+        (f"{name}[{names[:k].count(name)}]" if names.count(name) > 1 else name, x)
+        for k, (name, x) in enumerate(found)
+    ]
 
 
 def _pairs(lines: Sequence[str], find: Callable[[str], list[tuple[str, str]]]) -> Form | None:
@@ -371,12 +384,12 @@ def _named_lists(rows: list[list[str]], widths: Sequence[int]) -> list[list[str]
 
 
 def _unpacked(cell: str, names: Sequence[str]) -> list[str]:
-    items = _items(cell)
-    return items if len(items) == len(names) else [f"{cell}{x}" if cell else "" for x in names]
+    items, bare = _items(cell), re.sub(r"\[\d+\]\Z", "", cell)
+    return items if len(items) == len(names) else [f"{bare}{x}" if bare else "" for x in names]
 
 
 def _items(cell: str) -> list[str]:
-    """The numbers of a list; none where it is none."""
-    inner = re.fullmatch(r"[\[(](.*)[\])]", cell)
-    items = re.split(r"[,;\s]+", inner[1].strip()) if inner else []
-    return items if all(re.fullmatch(NUMBER, item) for item in items) else []
+    """The numbers of a list, in brackets or of three and more; none where it is none."""
+    items = re.split(r"[,;\s]+", re.sub(r"\A[\[(](.*)[\])]\Z", r"\1", cell).strip())
+    listed = cell[:1] in "[(" or len(items) > 2
+    return items if listed and all(re.fullmatch(NUMBER, item) for item in items) else []

@@ -51,7 +51,8 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
         _read_samples(stream, layout, end, samples)
     if samples.rows == 0:
         raise InputError("a header but no samples")
-    units = {column: layout.units[column] for column in wanted.columns if column in layout.units}
+    units = {c: layout.units[c] for c in wanted.columns if c in layout.units}
+    units = {c: unit for c, unit in units.items() if c not in wanted.datetimes}  # [hh:mm:ss]
     return RawTrial(
         samples.values(),
         samples.column(""),
@@ -383,7 +384,7 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
     return start + cut + 1, ("last line is cut off: 1 row dropped",)
 
 
-_NO_READING = re.compile(r"[^\d\s\"\\][^\d\"\\]{0,19}|[-+]?1\.#\w+|#[A-Z]+[/\d!?]*")
+_NO_READING = re.compile(r"[^\d\s\"\\][^\d\"\\]{0,19}|[-+]?1[.,]#\w+|#[A-Z]+[/\d!?]*")
 """Words for no reading, numbers of old C libraries among them."""
 _MOST_WORDS = 8
 _ROW = re.compile(r"Row #(\d+): ")
