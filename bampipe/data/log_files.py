@@ -15,6 +15,7 @@ from bampipe.data.recording import starts_of
 from bampipe.data.refusals import refusal
 from bampipe.data.session import TrialEntry, lexically_inside
 from bampipe.data.stated_rate import SMALL, units_stated
+from bampipe.data.units import unit
 from bampipe.data.vocabulary import by_word, word_set
 from bampipe.errors import InputError
 from bampipe.lists import join_names
@@ -152,35 +153,48 @@ class LogFiles:
             others = [name for name in names if axes[name] != axis]
             self._leave_out(others, f"not of {axis}, by name: for another session")
             names = [name for name in names if name not in others]
-        pairs = {n: self._renamed(names[0], n, common) for n in self.found if n not in names}
-        renamed = {name: own for name, own in pairs.items() if own}
-        for name in self.found.keys() - {*names, *renamed}:
-            lacking = [c for c in stated if c in common - self.found[name].keys()]
+        trials, wanted = [], [c for c in stated if c in common]
+        for name in [*names, *(n for n in self.found if n not in names)]:
+            own = {c: c for c in wanted} if name in names else self._renamed(names[0], name, wanted)
+            if own:
+                units = {c: (self._unit(names[0], c), self._unit(name, x)) for c, x in own.items()}
+                other = {c: here for c, (usual, here) in units.items() if _converts(here, usual)}
+                own = {c: x for c, x in own.items() if c != x}
+                trials.append(TrialEntry(file=name, kind="free", columns=own, units=other))
+                continue
+            lacking = [c for c in wanted if c not in self.found[name]]
             why = f"{_OTHER}, without {join_names(lacking, 3)}"
             if [*self.found[name]] == [f"column_{n}" for n, _ in enumerate(stated, 1)]:
                 why = f"no header; to read it like {names[0]}: --names {','.join(stated)}"
             self._leave_out([name], why)
-        trials = [TrialEntry(file=n, kind="free") for n in names]
-        trials += [TrialEntry(file=n, kind="free", columns=own) for n, own in renamed.items()]
-        return trials, [c for c in stated if c in common]
+        return trials, wanted
 
-    def _renamed(self, first: str, other: str, common: frozenset[str]) -> dict[str, str]:
-        """Columns of another file by those of the first, where words of its own name are in theirs.
+    def _unit(self, file: str, column: str) -> str:
+        """Unit of a column by its file, else by its name."""
+        stated = self.found[file][column]
+        return unit_of(column, stated, role_of(column, stated))
 
-        None unless it has all, with the same units.
+    def _renamed(self, first: str, other: str, wanted: Sequence[str]) -> dict[str, str]:
+        """Columns of another file by those of the first, alike but for words of the file's name.
+
+        And but for units of one quantity. None unless it has all.
         """
 
         def bare(file: str, columns: Collection[str]) -> dict[tuple[str, ...], str]:
             own = {*re.findall(r"[a-z]+|\d+", file.rpartition(".")[0].lower())}
-            split = {c: re.findall(r"[^\W\d_]+|\d+|%", c.lower()) for c in columns}
-            return {tuple(w for w in said if w not in own): c for c, said in split.items()}
+            found = dict[tuple[str, ...], str]()
+            for c in columns:
+                said = self._unit(file, c)
+                known = unit(said) if said else None
+                plain = "".join(c.rpartition(said)[::2]) if known else c
+                split = re.findall(r"[^\W\d_]+|\d+|%", plain.lower())
+                of = known.si if known else self.found[file][c]
+                found[(of, *(w for w in split if w not in own))] = c
+            return found
 
-        here, there = bare(first, common), bare(other, self.found[other])
-        if len(here) < len(common) or not here.keys() <= there.keys():
-            return {}
-        pairs = {column: there[key] for key, column in here.items()}
-        alike = all(self.found[first][x] == self.found[other][y] for x, y in pairs.items())
-        return pairs if alike else {}
+        here, there = bare(first, wanted), bare(other, self.found[other])
+        whole = len(here) == len(wanted) and here.keys() <= there.keys()
+        return {column: there[key] for key, column in here.items()} if whole else {}
 
     def _leave_out(self, names: Collection[str], why: str = _OTHER) -> None:
         self.passed += [(name, why) for name in self.found if name in names]
@@ -276,6 +290,12 @@ class LogFiles:
             + (", ..." if len(starts) > 4 else "")
         )
         return [trial.model_copy(update={"recording": n}) for n, _ in enumerate(starts, 1)]
+
+
+def _converts(text: str, to: str) -> bool:
+    """Whether two units are of one quantity and not the same."""
+    one, other = unit(text), unit(to)
+    return bool(one and other and one != other and one.si == other.si)
 
 
 def _like(path: Path) -> str:

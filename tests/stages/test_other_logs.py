@@ -39,14 +39,14 @@ I = 1.2 * np.sin(3 * T)  # noqa: E741
 
 
 def ingested(
-    folder: Path, text: str, *, time: str, encoder: str, current: str
+    folder: Path, text: str, *, time: str, encoder: str, current: str, trial: str = ""
 ) -> tuple[pd.DataFrame, pd.Series, dict]:
     """Samples, the trial's row and session.json of a session over one log."""
     folder.mkdir(exist_ok=True)
     (folder / "joint.toml").write_text(joint.DEVICE)
     (folder / "log.csv").write_text(text)
     session = HEAD.format(rate=RATE, time=time, encoder=encoder, current=current)
-    (folder / "session.toml").write_text(session)
+    (folder / "session.toml").write_text(session + trial)
     out = folder / "out"
     ingest.execute(RunFolder(out), out, ingest.Config(session=str(folder)), silent)
     trials = read_parquet(out / "ingest/trials.parquet")
@@ -185,6 +185,8 @@ def test_units_that_contradict_the_file_are_refused(tmp_path, change, said):
         "current": 'column = "i [mA]", unit = "mA"',
     }
     check(*ingested(tmp_path / "right", text, **right)[:2])
+    usual = {"encoder": 'column = "q [deg]", unit = "rad"', "trial": 'units = {"q [deg]" = "deg"}'}
+    check(*ingested(tmp_path / "own", text, **right | usual)[:2])
     with pytest.raises(InputError) as caught:
         ingested(tmp_path / "wrong", text, **{**right, **change})
     assert said in str(caught.value) and "\n" not in str(caught.value)

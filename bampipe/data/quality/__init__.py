@@ -23,7 +23,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
         InputError: the trial must be set aside; says why, and where in the file.
     """
     table = TrialTable(raw, session, entry, limits)
-    channels.refuse_other_units(table, raw.units)
+    channels.to_declared_units(table, raw.units)
     clock.keep_fresh_rows(table)
     clock.time_to_seconds(table)
     clock.drop_backward_stamps(table)

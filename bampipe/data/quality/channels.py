@@ -6,7 +6,7 @@ import numpy as np
 
 from bampipe.arrays import find_runs
 from bampipe.data.quality.table import TrialTable, longest_run
-from bampipe.data.session.channels import SECONDS, Channel, Encoder, Register
+from bampipe.data.session.channels import Channel, Encoder, Register
 from bampipe.data.session.conversion import Conversion
 from bampipe.data.units import unit
 from bampipe.lists import count_noun
@@ -18,12 +18,17 @@ LARGEST_VALUE = 1e6
 """No angle, force, torque or other input is as large as this in SI units."""
 
 
-def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
-    """Refuse a column whose unit in the file is not that of the session file."""
-    clock = table.session.clock
-    declared = {**table.session.raw_units}
-    if clock.unit in SECONDS:
-        declared[clock.column] = clock.unit
+def to_declared_units(table: TrialTable, stated: Mapping[str, str]) -> None:
+    """Convert columns that the trial has in other units than the tables of the session file.
+
+    InputError where the unit in the file is not that of the session file.
+    """
+    declared = table.session.raw_units | table.entry.units
+    for column, text in table.entry.units.items():
+        usual = table.session.raw_units[column]
+        here, there = unit(text), unit(usual)
+        table.columns[column] *= here.scale / there.scale if here and there else 1.0
+        table.notes.append(f"column '{column}' converted from {text} to {usual}")
     for column, text in stated.items():
         found, expected = unit(text), unit(declared.get(column, ""))
         if found is None or expected is None or "" in (found.si, expected.si):
@@ -35,7 +40,8 @@ def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
         if found == unit("Hz") and expected.si == "rad/s":  # turns a second
             found = unit("rev/s") or found
         if (found.si, found.scale) != (expected.si, expected.scale):
-            raise table.fault("other_unit", column, unit=text, declared=declared[column])
+            of = {"unit": text, "declared": declared[column], "column": column}
+            raise table.fault("other_unit", column, **of)
 
 
 def fill_missing(table: TrialTable) -> None:

@@ -30,6 +30,7 @@ from bampipe.data.session.channels import (
     Force,
     TimeUnit,
 )
+from bampipe.data.units import unit
 from bampipe.errors import InputError, did_you_mean
 from bampipe.files import is_inside, is_normal, read_toml
 from bampipe.schema import Declaration, NamedDeclaration, Positive, Several, Text, checked_by
@@ -133,6 +134,8 @@ class TrialEntry(NamedDeclaration):
     columns: dict[str, str] = Field(default={})
     """Where several trials stand side by side in a file: its columns, by the names that the tables
     give for the first of them"""
+    units: dict[str, Text] = Field(default={})
+    """Of columns that this trial has in another unit than the tables say, by their names there"""
     kind: Literal["free", "locked", "viscous"]
     """free: moved at will; locked: a brake holds one axis; viscous: in a field"""
     locked_axis: ChannelName | None = None
@@ -271,7 +274,7 @@ class Session(Declaration):
         if self.force is not None:
             found |= dict.fromkeys(self.force.columns, self.force.raw_unit)
         found |= {c.column: c.raw_unit for c in self.channels if c.raw_unit}
-        return found
+        return found | ({self.clock.column: self.clock.unit} if self.clock.unit in SECONDS else {})
 
     @property
     def device_file(self) -> Path | None:
@@ -312,6 +315,13 @@ class Session(Declaration):
         for column, times in Counter(columns).items():
             if times > 1:
                 yield refusal("column_twice", column=column, times=times)
+        stated = self.raw_units if columns else {}
+        for number, trial in enumerate(self.trials):
+            for column, text in trial.units.items():
+                known, expected = unit(text), unit(stated.get(column, ""))
+                if known is None or expected is None or known.si != expected.si:
+                    place, of = f"trials[{number}].units", stated.get(column, "no unit")
+                    yield refusal("no_unit_of", place, unit=text, column=column, declared=of)
         yield from self._faults_of_trials()
 
     def _faults_of_trials(self) -> Iterator[InputError]:

@@ -228,6 +228,9 @@ def _trials_tables(
             pairs = {c: own for c, own in trial.columns.items() if c in match.used and c != own}
             called = ", ".join(f"{quoted(c)} = {quoted(own)}" for c, own in pairs.items())
             yield from [f"columns = {{ {called} }}"] if called else []
+            units = {c: said for c, said in trial.units.items() if c in match.used}
+            converted = ", ".join(f"{quoted(c)} = {quoted(said)}" for c, said in units.items())
+            yield from [f"units = {{ {converted} }}"] if units else []
             for part in trial.parts:
                 if not any(name.startswith(f"{part.name}:") for name in match.used):
                     continue
