@@ -144,7 +144,8 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     )
     if logs.episodes is not None:
         logs.remarks = [VOCABULARY["remarks"]["lerobot"]]
-    remarks, timed = (*logs.remarks, *said, *guessed), any(c.role == "time" for c in columns)
+    remarks = (*logs.remarks, *said, *guessed)
+    timed = any(c.role == "time" and not c.is_constant for c in columns)
     stated = {} if timed else intervals_stated(folder, {trial.file for trial in sound})
     return Survey(tuple(sound), columns, remarks, tuple(logs.passed), stated)
 
@@ -188,7 +189,8 @@ def _read(
             # A column without a header, or of a matrix, may be named after the others.
             role = "time" if is_time(raw.columns[column][sound]) else role
         # The number of a message is named by its topic, like the readings beside it.
-        if role not in ("time", "reference") and _is_count(raw.columns[column]):
+        own = role_of(re.split("[:.]", column)[-1], said)
+        if role not in ("time", "reference", own) and _is_count(raw.columns[column]):
             role = ""
         unit = unit_of(column, said, role)
         if imperial and role == "position" and column.endswith("_in"):

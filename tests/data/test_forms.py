@@ -338,10 +338,27 @@ def test_a_drive_with_the_sign_of_the_reaction_is_turned(tmp_path: Path):
     assert "reaction = true  # guess" in propose(tmp_path).session
 
 
-def test_a_trial_in_another_unit_is_said():
+def test_a_trial_in_another_unit_is_said(tmp_path: Path):
     spans = {"a": {"q": 1.2}, "b": {"q": 71.0}, "c": {"q": 1.0}, "d": {"q": 1.4}}
     (said,) = describe_spans(spans)
     assert said.startswith("b: q goes 59.2 times as far as in the others")
+    write(tmp_path / "a.csv", "time_s,pos_mm,force\ns,mm,N", T, 1e3 * Q, U)
+    write(tmp_path / "b.csv", "time_s,pos_m,force\ns,m,kN", T, Q, U)
+    session, own = propose(tmp_path).session, 'units = { "pos_mm" = "m", "force" = "kN" }'
+    assert f'file = "b.csv"\nkind = "free"\ncolumns = {{ "pos_mm" = "pos_m" }}\n{own}' in session
+
+
+def test_a_clock_without_its_last_digits_is_said_and_a_note_gives_the_rate(tmp_path: Path):
+    write(tmp_path / "a.csv", "time,q_rad,tau_Nm", np.full(60, 1.76451e9), Q, U)
+    said = " ".join(propose(tmp_path).check)
+    assert "time is 1.76451e+09 in all rows; were its last digits printed?" in said
+    (tmp_path / "README.txt").write_text("Sampling rate: 100 Hz\n")
+    assert "sample_rate_hz = 100" in propose(tmp_path).session
+
+
+def test_a_position_of_even_steps_is_no_count(tmp_path: Path):
+    write(tmp_path / "a.csv", "time_s,position_mm,force_N", T + 1e-3 * Q, 0.4 * np.arange(60), U)
+    assert [column.role for column in survey(tmp_path).columns] == ["time", "position", "force"]
 
 
 HEAD = "LabVIEW Measurement\nSeparator\tTab\n***End_of_Header***\n\n"

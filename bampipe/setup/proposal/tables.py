@@ -176,9 +176,11 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
         taken = tuple(n for n in rates if n in constants)
         counted = (f'unit = "samples"{note}',)
         return ProposedClock(samples / rate_hz, taken, counted, f"sample_rate_hz = {rate_hz:g}")
-    stamps = next((column for column in found.of("time") if not column.is_constant), None)
+    stamps = min(found.of("time"), key=lambda column: column.is_constant, default=None)
     why = "no column increases like a time"
-    if stamps is not None:
+    if stamps is not None and stamps.is_constant:
+        why = f"{stamps.name} is {stamps.values[0]:g} in all rows; were its last digits printed?"
+    elif stamps is not None:
         steps = np.diff(stamps.values[np.isfinite(stamps.values)])
         if np.all(steps) and _MIXED < np.mean(steps < 0.0):
             raise refusal("out_of_order", found.trials[0].file, column=stamps.name)
