@@ -157,8 +157,9 @@ class LogFiles:
         for name in [*names, *(n for n in self.found if n not in names)]:
             own = {c: c for c in wanted} if name in names else self._renamed(names[0], name, wanted)
             if own:
-                units = {c: (self._unit(names[0], c), self._unit(name, x)) for c, x in own.items()}
-                other = {c: here for c, (usual, here) in units.items() if _converts(here, usual)}
+                units = {c: self._unit(name, x) for c, x in own.items()}
+                usual = {c: unit(self._unit(names[0], c)) for c in wanted}
+                other = {c: said for c, said in units.items() if said and unit(said) != usual[c]}
                 own = {c: x for c, x in own.items() if c != x}
                 trials.append(TrialEntry(file=name, kind="free", columns=own, units=other))
                 continue
@@ -290,12 +291,6 @@ class LogFiles:
             + (", ..." if len(starts) > 4 else "")
         )
         return [trial.model_copy(update={"recording": n}) for n, _ in enumerate(starts, 1)]
-
-
-def _converts(text: str, to: str) -> bool:
-    """Whether two units are of one quantity and not the same."""
-    one, other = unit(text), unit(to)
-    return bool(one and other and one != other and one.si == other.si)
 
 
 def _like(path: Path) -> str:

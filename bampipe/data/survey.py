@@ -85,6 +85,12 @@ class SurveyedColumn:
         known = self.values[np.isfinite(self.values)]
         return len(known) == 0 or bool(np.ptp(known) == 0.0)
 
+    @property
+    def may_number_rows(self) -> bool:
+        """Whether it rises by 1 a row, and nothing says that this is a time."""
+        timed = self.si == "s" or self.unit == "datetime"
+        return not timed and bool(np.all(np.diff(self.values) == 1.0))
+
 
 @dataclass(frozen=True)
 class Survey:
@@ -145,7 +151,8 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     if logs.episodes is not None:
         logs.remarks = [VOCABULARY["remarks"]["lerobot"]]
     remarks = (*logs.remarks, *said, *guessed)
-    timed = any(c.role == "time" and not c.is_constant for c in columns)
+    times = [c for c in columns if c.role == "time"]
+    timed = any(not (c.is_constant or c.may_number_rows) for c in times)
     stated = {} if timed else intervals_stated(folder, {trial.file for trial in sound})
     return Survey(tuple(sound), columns, remarks, tuple(logs.passed), stated)
 
@@ -185,8 +192,8 @@ def _read(
     for column in ordered:
         said = raw.units.get(column, labels[column])
         role = role_of(column, said)
-        if role and clock.column != column and re.search(r":column_\d+$|\[0\]$", column):
-            # A column without a header, or of a matrix, may be named after the others.
+        if role and clock.column != column and re.search(r":column_\d+$|\[0\]$|^t_", column):
+            # A column without a header, or of a matrix, may be named after the others; t_tau too.
             role = "time" if is_time(raw.columns[column][sound]) else role
         # The number of a message is named by its topic, like the readings beside it.
         own = role_of(re.split("[:.]", column)[-1], said)

@@ -173,6 +173,7 @@ def test_a_recorded_velocity_checks_the_position(tmp_path, velocity, said):
         ({"current": 'column = "i [mA]", unit = "V"'}, "channels.current.unit: a unit of V, but"),
         ({"time": 'column = "t [s]"\nunit = "samples"'}, "time.column: given although unit"),
         ({"time": 'unit = "s"'}, "time: 'column' is missing"),
+        ({"trial": 'units = { "q [deg]" = "s" }'}, "has s, which is not converted to deg"),
         ({"time": 'column = "t [s]"\nunit = "s"\nformat = "%S"'}, 'only for unit = "datetime"'),
         ({"encoder": 'column = "q [deg]", unit = "counts"'}, "expected a unit of rad, m, rad"),
     ],

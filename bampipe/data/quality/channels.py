@@ -23,12 +23,14 @@ def to_declared_units(table: TrialTable, stated: Mapping[str, str]) -> None:
 
     InputError where the unit in the file is not that of the session file.
     """
-    declared = table.session.raw_units | table.entry.units
+    usual = table.session.raw_units
+    declared = usual | table.entry.units
     for column, text in table.entry.units.items():
-        usual = table.session.raw_units[column]
-        here, there = unit(text), unit(usual)
-        table.columns[column] *= here.scale / there.scale if here and there else 1.0
-        table.notes.append(f"column '{column}' converted from {text} to {usual}")
+        here, there = unit(text), unit(usual.get(column, ""))
+        if here is None or there is None or here.si != there.si:
+            raise table.fault("no_unit", column, unit=text, declared=usual.get(column, "none"))
+        table.columns[column] *= here.scale / there.scale
+        table.notes.append(f"column '{column}' converted from {text} to {usual[column]}")
     for column, text in stated.items():
         found, expected = unit(text), unit(declared.get(column, ""))
         if found is None or expected is None or "" in (found.si, expected.si):

@@ -207,7 +207,7 @@ def _read_below(
     """
     body, names, end = lines[header.at + 1 :], header.names, header.at + 1
     first = heads.find_starts(body, [header.delimiter])[0][0]
-    scales, remarks = dict[str, float](), list[str]()
+    scales, remarks, given = dict[str, float](), list[str](), False
     for at, line in enumerate(body):
         remark = heads.is_remark(line.text)
         row = cells(heads.without_mark(line.text) if remark else line.text, header.delimiter)
@@ -224,15 +224,14 @@ def _read_below(
             and (not remark or heads.are_units(row))
             and (not is_property or all(unit(x) for x in row if x and not x[0].isdigit()))
         )
-        if not (remark or is_property or has_units):
+        if not (remark or is_property or (has_units and not given)):
             break
         end += 1
-        if has_units:
+        if has_units and not given:
             said = {h: bare(u) for h, u in zip(names, row, strict=False) if bare(u)}
             units = said | units if is_property else units | said
             remarks.append(f"row {line.number} gives units")
-            if not is_property:
-                break
+            given = not is_property
     return end, units, scales, remarks
 
 

@@ -256,16 +256,12 @@ def _elements(line: str) -> list[tuple[str, str]]:
 
 
 def _named(line: str) -> list[tuple[str, str]]:
-    """Numbers behind their names; those of a list, or of one name, are numbered."""
+    """Numbers behind their names; those of a list are numbered."""
     found = []
     for name, number, listed in _PAIR.findall(line):
         items = re.split(r"[,;\s]+", listed)
         found += [(f"{name}[{k}]", x) for k, x in enumerate(items) if x] or [(name, number)]
-    names = [name for name, _ in found]
-    return [
-        (f"{name}[{names[:k].count(name)}]" if names.count(name) > 1 else name, x)
-        for k, (name, x) in enumerate(found)
-    ]
+    return found
 
 
 def _pairs(lines: Sequence[str], find: Callable[[str], list[tuple[str, str]]]) -> Form | None:

@@ -30,7 +30,6 @@ from bampipe.data.session.channels import (
     Force,
     TimeUnit,
 )
-from bampipe.data.units import unit
 from bampipe.errors import InputError, did_you_mean
 from bampipe.files import is_inside, is_normal, read_toml
 from bampipe.schema import Declaration, NamedDeclaration, Positive, Several, Text, checked_by
@@ -315,13 +314,6 @@ class Session(Declaration):
         for column, times in Counter(columns).items():
             if times > 1:
                 yield refusal("column_twice", column=column, times=times)
-        stated = self.raw_units if columns else {}
-        for number, trial in enumerate(self.trials):
-            for column, text in trial.units.items():
-                known, expected = unit(text), unit(stated.get(column, ""))
-                if known is None or expected is None or known.si != expected.si:
-                    place, of = f"trials[{number}].units", stated.get(column, "no unit")
-                    yield refusal("no_unit_of", place, unit=text, column=column, declared=of)
         yield from self._faults_of_trials()
 
     def _faults_of_trials(self) -> Iterator[InputError]:

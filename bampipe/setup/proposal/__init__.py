@@ -225,12 +225,9 @@ def _trials_tables(
             stretch = {"recording": trial.recording, "start_s": start_s, "end_s": end_s}
             yield from (f"{key} = {value}" for key, value in stretch.items() if value is not None)
             yield from [f"part = {quoted(trial.part)}"] if trial.part else []
-            pairs = {c: own for c, own in trial.columns.items() if c in match.used and c != own}
-            called = ", ".join(f"{quoted(c)} = {quoted(own)}" for c, own in pairs.items())
-            yield from [f"columns = {{ {called} }}"] if called else []
-            units = {c: said for c, said in trial.units.items() if c in match.used}
-            converted = ", ".join(f"{quoted(c)} = {quoted(said)}" for c, said in units.items())
-            yield from [f"units = {{ {converted} }}"] if units else []
+            for key, of in (("columns", trial.columns), ("units", trial.units)):
+                pairs = ", ".join(f"{quoted(c)} = {quoted(of[c])}" for c in of if c in match.used)
+                yield from [f"{key} = {{ {pairs} }}"] if pairs else []
             for part in trial.parts:
                 if not any(name.startswith(f"{part.name}:") for name in match.used):
                     continue

@@ -71,8 +71,8 @@ class ProposedClock:
 
 def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     """Propose a clock: by stamps in one column or two, else by counting samples."""
-    nameless = [c for c in found.columns if c.by_looks or not c.role]
-    numbers = {c.name for c in nameless if np.all(np.diff(c.values) == 1.0)}
+    numbered = [c for c in found.columns if c.may_number_rows]
+    numbers = {c.name for c in numbered if c.by_looks or not c.role or found.intervals}
     unsaid = [c for c in found.columns if not c.role]
     counters = [c for c in unsaid if not _COUNTERS.isdisjoint(words(c.name))]
     unnamed = [c for c in unsaid if c not in counters and _counts_on(c)]
@@ -115,12 +115,14 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
         lines = [named, 'unit = "ticks"', f"ticks_per_s = {1.0 / size:.10g}{note}"]
         t = stamps * size
         return ProposedClock(t, (column.name,), lines, _stamped_rate(t, notes))
-    if not kind:
+    if not kind or (column.may_number_rows and not named_unit):
         if counter:
             note = notes.ask("ticks", clock=column.name, step=np.median(np.diff(stamps)))
             lines = [named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}"]
         else:
-            note = notes.ask("time_unit")
+            why = "it rises by 1 a row, as ms at 1000 Hz and numbers of rows do"
+            why = why if column.may_number_rows else "no unit gives a likely rate"
+            note = notes.ask("time_unit", why=why)
             lines = [named, f'unit = "{UNKNOWN}"{note}']
         return ProposedClock(np.arange(len(stamps)) / _LIKELY_RATE_HZ, (column.name,), lines)
     t = stamps * SECONDS.get(kind, 1.0)
