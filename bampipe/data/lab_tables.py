@@ -15,6 +15,7 @@ import pandas as pd
 import pyarrow as pa
 
 from bampipe.data import store
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError
 from bampipe.files import packaged_table
 
@@ -69,9 +70,7 @@ def read(folder: Path, table: str) -> pd.DataFrame:
     try:
         return pd.read_parquet(folder / table)
     except (OSError, ValueError) as error:
-        raise InputError(
-            "not a sound data set", where=str(folder / table), remedy="run `bampipe lab` again"
-        ) from error
+        raise refusal("no_data_set", str(folder / table)) from error
 
 
 def moment(text: str | None) -> datetime | None:

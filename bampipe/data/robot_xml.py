@@ -7,11 +7,11 @@ from io import BytesIO
 from pathlib import Path
 from xml.etree import ElementTree
 
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError
 from bampipe.files import read_bytes
 
 LARGEST_BYTES = 20_000_000
-_MEND = "mend it, or take it out of the folder"
 DEEPEST = 200
 """Most elements inside one another, and links one behind another."""
 Attribute = str | float | Iterable[float]
@@ -33,9 +33,8 @@ def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
         root = ElementTree.fromstring(text, ElementTree.XMLParser(target=builder))
     except ElementTree.ParseError as error:
         line = error.position[0]
-        raise InputError(
-            f"not XML: {str(error).partition(':')[0]}", where=f"{where}, line {line}", remedy=_MEND
-        ) from error
+        why = str(error).partition(":")[0]
+        raise refusal("no_xml", f"{where}, line {line}", why=why) from error
     if to_write:  # namespaces have the prefixes that they have in the text
         for _, (prefix, name) in ElementTree.iterparse(BytesIO(text), events=("start-ns",)):
             with suppress(ValueError):  # ns1 and the like, which are given anew
@@ -44,8 +43,7 @@ def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
     while level := [inner for element in level for inner in element]:
         depth += 1
         if depth > DEEPEST:
-            what = f"elements are nested more than {DEEPEST} deep"
-            raise InputError(what, where=where, remedy=_MEND)
+            raise refusal("nested", where, deepest=DEEPEST)
     return root
 
 

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bampipe.data.readers.trial import check_columns
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError
 from bampipe.files import atomic_writer
 
@@ -204,6 +205,4 @@ def _damage_named(path: Path) -> Iterator[None]:
     try:
         yield
     except (pa.ArrowException, OSError) as error:
-        raise InputError(
-            "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
-        ) from error
+        raise refusal("no_parquet", str(path)) from error

@@ -97,9 +97,7 @@ class SampleStream:
         cut = text.rfind(b"\n") + 1
         self._rest = text[cut:]
         if len(self._rest) > LONGEST_LINE:
-            raise InputError(
-                "a line without end: this is no text table", where=f"{self.name}: {self._line + 1}"
-            )
+            raise refusal("no_line_end", f"{self.name}: {self._line + 1}")
         rows: dict[int, list[float]] = {}
         for line in text[:cut].decode("utf-8", errors="replace").splitlines():
             self._line += 1

@@ -19,7 +19,7 @@ from bampipe.data.refusals import refusal
 from bampipe.data.session import TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS, Clock
 from bampipe.data.stated_rate import intervals_stated
-from bampipe.data.units import RecordedUnit, spelled, unit
+from bampipe.data.units import spelled, unit
 from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError
 from bampipe.lists import join_names
@@ -54,24 +54,21 @@ class SurveyedColumn:
     quantity: str = ""
 
     @property
-    def conversion(self) -> RecordedUnit | None:
-        """Conversion of its unit to SI; None if it has no known unit."""
-        return unit(self.unit) if self.unit else None
-
-    @property
     def si(self) -> str | None:
-        """SI unit of its quantity; None if that is unknown."""
-        return self.conversion.si if self.conversion is not None else None
+        """SI unit of its quantity; None if it has no known unit."""
+        known = unit(self.unit) if self.unit else None
+        return known.si if known is not None else None
 
     @property
     def scale(self) -> float:
         """What makes SI of its values, 1 where that is not known."""
-        return self.conversion.scale if self.conversion is not None else 1.0
+        known = unit(self.unit)
+        return known.scale if known is not None else 1.0
 
     @property
     def is_foreign(self) -> bool:
         """Whether the file states a unit that is not known."""
-        return bool(self.stated) and self.conversion is None
+        return bool(self.stated) and self.si is None
 
     @property
     def is_integer(self) -> bool:
@@ -196,9 +193,9 @@ def _read(
             # A column without a header, or of a matrix, may be named after the others; t_tau too.
             role = "time" if is_time(raw.columns[column][sound]) else role
         # The number of a message is named by its topic, like the readings beside it.
-        own = role_of(re.split("[:.]", column)[-1], said)
-        if role not in ("time", "reference", own) and _is_count(raw.columns[column]):
-            role = ""
+        own, steps = role_of(re.split("[:.]", column)[-1], said), np.diff(raw.columns[column])
+        counts = len(steps) > 3 and np.ptp(steps) < 1e-6 * np.min(steps)
+        role = "" if counts and role not in ("time", "reference", own) else role
         unit = unit_of(column, said, role)
         if imperial and role == "position" and column.endswith("_in"):
             unit = unit or "in"
@@ -229,12 +226,6 @@ def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
     kept = [mask for mask in known if 2 * mask.sum() > len(mask)]
     complete = np.logical_and.reduce(kept) if kept else np.ones(len(known[0]), dtype=bool)
     return complete if 2 * complete.sum() > len(complete) else np.ones_like(complete)
-
-
-def _is_count(values: np.ndarray) -> bool:
-    """Whether values (T,) rise by the same step from each row to the next."""
-    steps = np.diff(values)
-    return len(steps) > 3 and bool(np.ptp(steps) < 1e-6 * np.min(steps))
 
 
 def _by_looks(

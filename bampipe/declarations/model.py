@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from bampipe.errors import InputError
+from bampipe.data.refusals import refusal
 from bampipe.files import read_toml, toml_text
 from bampipe.schema import Declaration, Several, Text, read
 
@@ -37,9 +37,5 @@ def read_model_file(path: Path) -> ModelFile:
     """
     model = read(ModelFile, read_toml(path), str(path))
     if model.parent and not (path.parent.parent / model.parent / path.name).is_file():
-        raise InputError(
-            f"model {model.name!r} has parent {model.parent!r}, which is missing",
-            where=str(path),
-            remedy="restore the parent's folder, or remove the child's",
-        )
+        raise refusal("no_parent", str(path), model=model.name, parent=model.parent)
     return model

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from bampipe.data import lab_tables, store
+from bampipe.data.refusals import refusal
 from bampipe.data.run_folder import BASE, RunFolder
-from bampipe.errors import InputError
 from bampipe.phrases import diagnosis as phrases
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
@@ -38,11 +38,7 @@ def read_run(root: Path) -> dict[str, list[dict[str, Any]]]:
     try:
         recorded = lab_tables.moment(session.recorded_at)
     except ValueError as error:
-        raise InputError(
-            f"recorded_at is not a time ({error})",
-            where=str(run.path(IngestResult.FILE)),
-            remedy="make it again (--force)",
-        ) from error
+        raise refusal("no_moment_of_run", str(run.path(IngestResult.FILE)), why=error) from error
     key = {"session_id": root.name, "device": session.device, "recorded_at": recorded}
     tables = defaultdict[str, list[dict[str, Any]]](list)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.arrays import Array
+from bampipe.data.refusals import refusal
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import Session, read_session
 from bampipe.data.session.conversion import Conversion
@@ -111,11 +112,7 @@ def list_layouts(system: System, session: Session | None) -> tuple[Conversion, .
     given = {*device.forces, *device.channels, *device.brakes.values(), "t"}
     derived = [name for name in system.inputs if name not in given]
     if derived:
-        raise InputError(
-            f"the model needs {derived[0]}, which is not known in real time",
-            where="bampipe monitor",
-            remedy="monitor a model without this effect",
-        )
+        raise refusal("not_in_real_time", name=derived[0])
     brakes = {name: f"brake_{axis}" for axis, name in device.brakes.items()}
     positions = [f"q_{axis}" for axis in system.coordinates]
     others = [name for name in system.inputs if name not in brakes and name != "t"]
@@ -164,19 +161,11 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
     found = run.read(IdentifyResult, name)
     path = IdentifyResult.file(name)
     if found.noise is None:
-        raise InputError(
-            "identified without the filter, so that the noise levels are not known",
-            where=str(run.path(path)),
-            remedy=f"bampipe identify {run.root} --set method=ukf",
-        )
+        raise refusal("no_noise", str(run.path(path)), root=run.root)
     values, names = read_estimate(run, name, system), found.covariance.names
     ingested = run.read(IngestResult)
     if ingested.kept_every > 1:
-        raise InputError(
-            f"identified from one sample in {ingested.kept_every}, but a stream has all of them",
-            where=str(run.path(IngestResult.FILE)),
-            remedy="bampipe run SESSION --set ingest.fastest_hz=0",
-        )
+        raise refusal("thinned", str(run.path(IngestResult.FILE)), every=ingested.kept_every)
     rate = ingested.sample_rate_hz
     trials = [_read_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
     model = build_filter_model(system, trials, values, False, found.input_timing.estimate)
@@ -211,11 +200,8 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
         try:
             filtered = filter_trials(model, [begun], theta, covariance, settings).trials[0]
         except FilterFailure as failure:
-            raise InputError(
-                f"the identified model does not follow its own trials: {failure.reason}",
-                where=str(run.path(path)),
-                remedy=f"bampipe diagnose {run.root}{run.model_option(name)}",
-            ) from failure
+            of = {"why": failure.reason, "run": f"{run.root}{run.model_option(name)}"}
+            raise refusal("does_not_follow", str(run.path(path)), **of) from failure
         means.append(window_means(filtered.nis[window:], n, window))
     threshold = find_threshold(options.probability, window * n, np.concatenate(means))
     return system, replace(start, threshold=threshold)

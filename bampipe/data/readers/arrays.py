@@ -31,7 +31,6 @@ _RUN = re.compile(
     r"(?:\[([^\[\]:]+)\]|(\d+))[./_]([^\[\]]+)"
 )
 """Name of an array of one of several recordings in a file."""
-_TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
 TIME = "@time"
 """End of the name of the times of a channel that has its own."""
 _CLOCK = re.compile(r"(?i)(?:.*[._/@])?(?:t|\w*time|\w*stamp)(?:_[a-z]+|\d+)?\Z")
@@ -125,8 +124,7 @@ def _fault(variable: str, known: Arrays, where: str) -> InputError:
     """Error on a variable that is missing, or is no array of numbers, moments or texts."""
     within = (f"{variable}.", f"{variable}/", f"{variable}[0].")
     if inside := [other for other in known if other.startswith(within)]:
-        remedy = f"name what is in it: {', '.join(inside[:8])}"
-        return InputError("a structure, expected a vector of numbers", where=where, remedy=remedy)
+        return refusal("structure", where, inside=", ".join(inside[:8]))
     paths = accumulate(variable.split("/"), "{}/{}".format)
     if any(known[path].kind == LINK for path in paths if path in known):
         return InputError("a link, expected numbers in this file", where=where)
@@ -235,10 +233,7 @@ def pick(values: np.ndarray, index: int | None) -> np.ndarray:
     sides = [extent for extent in values.shape if extent != 1] if 0 not in values.shape else []
     if index is None:
         if len(sides) > 1:
-            raise InputError(
-                f"a {_by(values.shape)} array, expected a vector",
-                remedy="name one of its columns, as in X[0]" if len(sides) == 2 else "",
-            )
+            raise refusal("matrix" if len(sides) == 2 else "array", shape=_by(values.shape))
         return values.ravel()
     if len(sides) > 2 or not sides:
         raise InputError("has no columns to choose from")
@@ -298,21 +293,19 @@ def _at_one_rate(arrays: Arrays) -> Arrays:
     return found
 
 
-def _by_clock(names: dict[str, str], arrays: Arrays) -> list[dict[str, str]]:
+def _by_clock(names: Mapping[str, str], arrays: Arrays) -> list[dict[str, str]]:
     """The arrays of a group, by key, behind the clock of each; of clocks, that of its length."""
     length = {key: max(arrays[name].shape) for key, name in names.items()}
-    clocks = {length[key]: key for key, name in reversed(names.items()) if _is_clock(name, arrays)}
+    clocks = dict[int, str]()
+    for key, name in names.items():
+        called = _CLOCK.match(name) and labels("", arrays[name].shape) == [""]
+        t = arrays[name].load().ravel() if called else np.zeros(1)
+        if np.all(np.diff(t) >= 0) and t[-1] > t[0]:
+            clocks.setdefault(length[key], key)
     return [
-        {key: names[key], **{x: name for x, name in names.items() if x != key and length[x] == own}}
+        {x: names[x] for x in (key, *names) if x == key or length[x] == own}
         for own, key in clocks.items()
     ]
-
-
-def _is_clock(name: str, arrays: Arrays) -> bool:
-    """Whether an array is called a time, and never falls."""
-    called = _CLOCK.match(name) and labels("", arrays[name].shape) == [""]
-    t = arrays[name].load().ravel() if called else np.zeros(0)
-    return len(t) > 1 and bool(np.all(np.diff(t) >= 0) and t[-1] > t[0])
 
 
 def _resampled(at: Stored, times: Stored, values: Stored) -> np.ndarray:
@@ -336,7 +329,7 @@ def _join_runs(arrays: Arrays) -> tuple[dict[str, Stored], dict[str, tuple[int, 
         match = _RUN.fullmatch(label)
         if match and labels("", array.shape) and math.prod(array.shape) > 1:
             runs.setdefault(f"{match[1]}[:].{match[4]}", {})[match[3] or f"[{match[2]}]"] = label
-    timed = {name.partition("[")[0]: list(own) for name, own in runs.items() if _TIMES.search(name)}
+    timed = {name.partition("[")[0]: list(own) for name, own in runs.items() if _CLOCK.match(name)}
     for name, own in runs.items():
         parts = [found[label] for label in own.values()]
         sizes = [math.prod(part.shape) for part in parts]

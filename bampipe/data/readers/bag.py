@@ -150,9 +150,7 @@ def _read_streams(path: Path, fields: Mapping[str, Field], wanted: Wanted) -> li
         check_size(samples, wanted)
     for column, each in fields.items():
         if not each.is_time and all(column not in s.cells for s in streams.values()):
-            raise InputError(
-                f"no field '{each.path}'", where=f"column '{column}'", remedy=f"it has {near:.200}"
-            )
+            raise refusal("field_missing", f"column '{column}'", path=each.path, near=near)
     return list(streams.values())
 
 

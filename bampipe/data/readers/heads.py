@@ -163,7 +163,9 @@ def find_header(lines: list[Line], columns: Sequence[str], dialect: Dialect) -> 
     found = ((_find_above(lines, *start), start[1]) for start in starts)
     index, delimiter = next((each for each in found if each[0] >= 0), (-1, ""))
     row = names(index, delimiter) if index >= 0 else []
-    listed = _listed(lines[:first])
+    numbered = [match for line in lines[:first] if (match := _LISTED.match(line.text))]
+    in_order = {int(after[1]) - int(match[1]) for match, after in pairwise(numbered)} == {1}
+    listed = [match[2].strip() for match in numbered] if in_order else []  # by number, a line each
     unnamed = sum(bool(re.search(r"\w", name)) for name in row) < width
     unnamed |= index >= 0 and _LISTED.match(lines[index].text) is not None
     if unnamed and len(listed) == width > 1 and {*columns} <= {*listed}:
@@ -267,13 +269,6 @@ def _says_more(row: list[str]) -> bool:
     """Whether a line below the names holds units or numbers behind a key, or the key alone."""
     said = [cell for cell in of_properties(row)[0] if cell]
     return not said or (len(said) < len(row) and all(unit(x) or POINT.match(x) for x in said))
-
-
-def _listed(above: list[Line]) -> list[str]:
-    """Names of the columns where they are listed a line each above the samples, by number."""
-    found = [match for line in above if (match := _LISTED.match(line.text))]
-    in_order = {int(after[1]) - int(match[1]) for match, after in pairwise(found)} == {1}
-    return [match[2].strip() for match in found] if in_order else []
 
 
 def _fitted(row: list[str], text: str, width: int) -> list[str]:

@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from pyarrow import dataset
 
 from bampipe.data.readers.arrays import LARGEST_WIDTH
+from bampipe.data.refusals import refusal
 from bampipe.errors import InputError
 from bampipe.files import read_json_table
 
@@ -46,16 +47,14 @@ def find_episodes(folder: Path, episodes: str = "") -> dict[str, list[int]] | No
     """
     if not _features(folder):
         if episodes:
-            remedy = f"it has no {INFO} of one; leave --episodes out"
-            raise InputError("no data set of LeRobot", where=str(folder), remedy=remedy)
+            raise refusal("no_lerobot", str(folder), info=INFO)
         return None
     found = {}
     for path in sorted(folder.glob("data/*/*.parquet")):
         try:
             column = pq.read_table(path, columns=[EPISODE]).column(0).to_numpy()
         except (pa.ArrowException, OSError, IndexError) as error:
-            what = f"no sound Parquet file with a column {EPISODE}"
-            raise InputError(what, where=str(path), remedy="download it again") from error
+            raise refusal("no_episodes", str(path), column=EPISODE) from error
         starts = [0, *_changes(column)] if len(column) else []
         found[path.relative_to(folder).as_posix()] = [int(column[at]) for at in starts]
     known = sorted(number for numbers in found.values() for number in numbers)

@@ -64,8 +64,7 @@ def nanoseconds(values: Sequence[str | None] | np.ndarray, form: str, row: int =
     try:
         moments = pd.to_datetime(plain, format=form or "ISO8601", utc=True, errors="coerce")
     except (ValueError, OverflowError) as error:
-        what = f"'{form}' is no form of a date and time"
-        raise InputError(what, remedy="give it in the codes of strptime") from error
+        raise refusal("no_form", form=form) from error
     wrong = (moments.isna() & text.notna() & (text != "")).to_numpy()
     if wrong.any():
         at = int(np.argmax(wrong))

@@ -14,6 +14,7 @@ from typing import Any
 from bampipe.data.readers.heads import cells
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER
+from bampipe.data.refusals import refusal
 from bampipe.data.units import unit
 from bampipe.data.vocabulary import VOCABULARY
 from bampipe.errors import InputError
@@ -145,8 +146,7 @@ def find_form(head: str) -> Form | None:
             return pairs
     behind = [match[0] for line in lines if (match := _BEHIND.search(line))]
     if len(behind) > max(_FEWEST, (1.0 - _MOST) * len(lines)):
-        remedy = "export with the minus before the number, not behind it and not as brackets"
-        raise InputError(f"'{behind[0]}' may be a negative number", remedy=remedy)
+        raise refusal("minus_behind", cell=behind[0])
     for delimiter in (*_DELIMITERS, " "):
         table = [cells(line, delimiter) for line in (*whole[:_TRIED], *lines)]
         width = Counter(map(len, table)).most_common(1)[0][0]

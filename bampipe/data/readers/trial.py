@@ -117,9 +117,8 @@ def aligned(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
     count = len(values[first]) if values else 0
     for column, value in values.items():
         if len(value) not in (1, count):
-            raise InputError(
-                f"{len(value)} values, where '{first}' has {count}", where=f"{what} '{column}'"
-            )
+            of = {"here": len(value), "first": first, "there": count}
+            raise refusal("other_length", f"{what} '{column}'", **of)
     return {c: np.repeat(v, count) if len(v) == 1 < count else v for c, v in values.items()}
 
 
@@ -149,7 +148,4 @@ def need(module: str, extra: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        package = module.partition(".")[0]
-        raise InputError(
-            f"needs {package}, which is not installed", remedy=f"pip install 'bampipe[{extra}]'"
-        ) from error
+        raise refusal("needs", package=module.partition(".")[0], extra=extra) from error

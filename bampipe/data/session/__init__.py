@@ -188,10 +188,8 @@ def _with_ids(trials: tuple[TrialEntry, ...]) -> tuple[TrialEntry, ...]:
 
 
 def _no_axis(name: str, axes: Sequence[str], where: str, what: str = "") -> InputError:
-    remedy = f"the axes are {', '.join(axes)}"
-    return InputError(
-        f"no {what}axis '{name}'{did_you_mean(name, axes)}", where=where, remedy=remedy
-    )
+    of = {"name": f"{what}axis '{name}'", "near": did_you_mean(name, axes)}
+    return refusal("unknown_axis", where, **of, axes=", ".join(axes))
 
 
 class Session(Declaration):

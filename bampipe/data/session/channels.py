@@ -302,9 +302,7 @@ class Force(Declaration):
             if not self.volts and given:
                 yield refusal("no_calibration", key, unit=self.raw_unit)
         if self.volts and self.zero_v is not None and len(self.zero_v) != columns:
-            yield InputError(
-                f"found {len(self.zero_v)}, expected {columns}, one a column", where="zero_v"
-            )
+            yield refusal("zeros", found=len(self.zero_v), columns=columns)
         if self.volts and self.calibration_n_per_v is not None:
             rows = self.calibration_n_per_v
             lengths = sorted({len(row) for row in rows})
@@ -352,9 +350,7 @@ class BrakeTable(Declaration):
         for axis, unit in zip(named, stated, strict=True):
             expected = "N.m" if axes[axis].unit == "rad" else "N"
             if unit != expected:
-                raise InputError(
-                    f'found "{unit}" for {axis}, expected "{expected}"', where="brakes.unit"
-                )
+                raise refusal("brake_unit", axis=axis, found=unit, expected=expected)
         return tuple(map(Brake, named, self.columns, stated))
 
 

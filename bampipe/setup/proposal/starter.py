@@ -144,10 +144,16 @@ def starter_device(
     listed, driven = " and ".join(constants), "driven" if motor else "prescribed"
     wide = 5.0 if drive.scaled else 100.0  # nobody knows yet what one of it is worth
     viscous, coulomb = (", ".join(_prior(size, wide)) for size in (found.viscous, found.coulomb))
+    sets = "they set" if len(constants) > 1 else "sets"
+    table = "\n".join([sentence("constants_set", sets=sets), *constants.values(), "", ""])
+    still = "no_weight_slides" if linear else "no_weight_turns"
+    potential = sentence(still, axis=axis, end=end)
+    if weight is not None:
+        potential = sentence("weight", axis=axis, doubt=weight.doubt or "the motion shows it")
     text = sentence(
         "device", axis=axis, end=end, kind=kind, role=drive.role, symbol=axis[0], source=source,
-        sign_width=width if drive.coil or sign_width else "", constants=_constants_table(constants),
-        potential=_potential(axis, linear, weight, end), rubbed=rubbed, unit=unit, applied=applied,
+        sign_width=width if drive.coil or sign_width else "", constants=table if constants else "",
+        potential=potential, rubbed=rubbed, unit=unit, applied=applied,
         column=f"             # {drive.column}" if drive.column else "", channels=channels,
         drive=sentence(driven) if motor or drive.coil else "", rate=rate, torque=torque,
         scaled=listed and sentence("scaled", constants=listed), viscous=viscous, coulomb=coulomb,
@@ -208,20 +214,6 @@ def stage_device(of_axes: Sequence[str]) -> str:
         elif title not in ("[energy]", "[inputs]"):
             first += f"\n{title}\n{own}"
     return first
-
-
-def _constants_table(constants: dict[str, str]) -> str:
-    if not constants:
-        return ""
-    sets = "they set" if len(constants) > 1 else "sets"
-    head = f"[constants]                         # {sets} the scale of all that is estimated"
-    return "\n".join([head, *constants.values(), "", ""])
-
-
-def _potential(axis: str, linear: bool, weight: Weight | None, end: str) -> str:
-    if weight is None:
-        return sentence("no_weight_slides" if linear else "no_weight_turns", axis=axis, end=end)
-    return sentence("weight", axis=axis, doubt=weight.doubt or "the motion shows it")
 
 
 def _least_inertia(linear: bool, coil: bool, found: Driven, wide: float) -> float:

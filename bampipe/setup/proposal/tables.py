@@ -75,7 +75,9 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     numbers = {c.name for c in numbered if c.by_looks or not c.role or found.intervals}
     unsaid = [c for c in found.columns if not c.role]
     counters = [c for c in unsaid if not _COUNTERS.isdisjoint(words(c.name))]
-    unnamed = [c for c in unsaid if c not in counters and _counts_on(c)]
+    steps = {c.name: np.diff(c.values) for c in unsaid if guesses.is_time(c.values)}
+    even = {name for name, own in steps.items() if np.ptp(own) < np.median(own)}
+    unnamed = [c for c in unsaid if c not in counters and c.name in even]
     whole = [c for c in found.of("time") if c.is_integer]
     for rest in reversed(whole):
         for seconds in reversed(whole):
@@ -193,12 +195,6 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
     note = notes.guess(f"samples are counted: {why}")
     rate = UNKNOWN_RATE + notes.ask("rate")
     return ProposedClock(samples / _LIKELY_RATE_HZ, (), (f'unit = "samples"{note}',), rate)
-
-
-def _counts_on(column: SurveyedColumn) -> bool:
-    """Whether a column whose name says nothing rises evenly."""
-    steps = np.diff(column.values)
-    return guesses.is_time(column.values) and bool(np.ptp(steps) < np.median(steps))
 
 
 def _numbers_rows(column: SurveyedColumn) -> bool:
@@ -496,7 +492,7 @@ def _channel(name: str, si: str, column: SurveyedColumn, why: str, match: Matche
         return entry(column.name, UNKNOWN, fields) + ask
     if si == "A" and column.is_integer and not column.unit:
         return entry(column.name, UNKNOWN, fields) + notes.ask("current_unit", column=column.name)
-    if column.conversion is not None and column.si != si:
+    if column.si not in (None, si):
         ask = notes.ask("rated", name, si=si, unit=bare(column.unit))
         return entry(column.name, si, f"{fields}, scale = 0.0") + ask
     likely = si if register else guesses.likely_unit(si, column.values) or si
