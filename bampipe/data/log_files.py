@@ -181,21 +181,22 @@ class LogFiles:
         And but for units of one quantity. None unless it has all.
         """
 
-        def bare(file: str, columns: Collection[str]) -> dict[tuple[str, ...], str]:
-            own = {*re.findall(r"[a-z]+|\d+", file.rpartition(".")[0].lower())}
+        def bare(file: str, columns: Collection[str], whole: bool) -> dict[tuple[str, ...], str]:
+            own = {*re.findall(r"[a-z]+|\d+", "" if whole else file.rpartition(".")[0].lower())}
             found = dict[tuple[str, ...], str]()
             for c in columns:
-                said = self._unit(file, c)
-                known = unit(said) if said else None
+                known = unit(said) if (said := self._unit(file, c)) else None
                 plain = "".join(c.rpartition(said)[::2]) if known else c
                 split = re.findall(r"[^\W\d_]+|\d+|%", plain.lower())
                 of = known.si if known else self.found[file][c]
                 found[(of, *(w for w in split if w not in own))] = c
             return found
 
-        here, there = bare(first, wanted), bare(other, self.found[other])
-        whole = len(here) == len(wanted) and here.keys() <= there.keys()
-        return {column: there[key] for key, column in here.items()} if whole else {}
+        for whole in (True, False):
+            here, there = bare(first, wanted, whole), bare(other, self.found[other], whole)
+            if len(here) == len(wanted) and here.keys() <= there.keys():
+                return {column: there[key] for key, column in here.items()}
+        return {}
 
     def _leave_out(self, names: Collection[str], why: str = _OTHER) -> None:
         self.passed += [(name, why) for name in self.found if name in names]

@@ -187,6 +187,8 @@ def test_a_trial_a_row_of_parquet_and_signals_at_rates_of_their_own(tmp_path):
     assert list(columns_of(tmp_path / "a.npz")) == ["t_q", "q", "u[0]", "u[1]"]
     trial = read_trial(tmp_path / "a.npz", ("t_q", "q", "u[0]"))
     np.testing.assert_allclose(trial.columns["u[0]"][:-1], 3.0 * t[:-1])
+    np.savez(tmp_path / "b.npz", t_q=t, q=t, t_u=1e3 * t[::2], u=t[::2])
+    assert "its clock goes from 0 to 198000, and that" in refused(tmp_path / "b.npz", ("t_q", "u"))
 
 
 # TDMS

@@ -310,6 +310,8 @@ def _by_clock(names: Mapping[str, str], arrays: Arrays) -> list[dict[str, str]]:
 
 def _resampled(at: Stored, times: Stored, values: Stored) -> np.ndarray:
     t, own = (array.load().astype(float).ravel() for array in (at, times))
+    if max(t[0], own[0]) > min(t[-1], own[-1]) or not 0.01 < np.ptp(own) / np.ptp(t) < 100.0:
+        raise refusal("clocks_apart", first=own[0], last=own[-1], start=t[0], end=t[-1])
     table = values.load().astype(float)
     columns = (table if len(table) == own.size else table.T).reshape(own.size, -1).T
     return np.column_stack([trial.interpolated(t, own, column) for column in columns])
