@@ -348,8 +348,7 @@ def test_a_trial_in_another_unit_is_said(tmp_path: Path):
 
 def test_a_clock_without_its_last_digits_is_said_and_a_note_gives_the_rate(tmp_path: Path):
     write(tmp_path / "a.csv", "time,q_rad,tau_Nm", np.full(60, 1.76451e9), Q, U)
-    said = " ".join(propose(tmp_path).check)
-    assert "time is 1.76451e+09 in all rows; were its last digits printed?" in said
+    assert "time is 1.76451e+09 in all rows; were its last" in str(propose(tmp_path).check)
     (tmp_path / "README.txt").write_text("Sampling rate: 100 Hz\n")
     assert "sample_rate_hz = 100" in propose(tmp_path).session
 

@@ -207,7 +207,7 @@ def _stamped_rate(t: np.ndarray, notes: Notes) -> str:
     (slowest, fastest), rate_hz = guesses.RATES_HZ, guesses.sample_rate(t)
     doubt = "" if rate_hz > _SLOW_HZ else "; too slow for inertia and quick reversals: log faster"
     if not slowest <= rate_hz <= fastest:
-        doubt = "; motion is not logged so: is its unit right?"
+        return UNKNOWN_RATE + notes.ask("time_unit", why=f"{rate_hz:g} Hz is no rate of motion")
     note = notes.guess(f"{rate_hz:g} Hz, from the time stamps{doubt}")
     return f"sample_rate_hz = {rate_hz:g}{note}"
 
