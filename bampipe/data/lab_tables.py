@@ -11,12 +11,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
 
-import pandas as pd
 import pyarrow as pa
 
 from bampipe.data import store
-from bampipe.data.refusals import refusal
-from bampipe.errors import InputError
 from bampipe.files import packaged_table
 
 Row = Mapping[str, object]
@@ -57,20 +54,6 @@ def write(folder: Path, rows: Mapping[str, Sequence[Row]]) -> dict[str, int]:
             if old.name not in parts.values():
                 shutil.rmtree(old)
     return {name: len(rows.get(name, ())) for name in TABLES}
-
-
-def read(folder: Path, table: str) -> pd.DataFrame:
-    """Return a whole table, ``device`` as its last column.
-
-    Raises:
-        InputError: there is no such table in ``folder``, or it is damaged.
-    """
-    if not (folder / table).is_dir():
-        raise InputError(f"no table {table!r}", where=str(folder), remedy="run `bampipe lab`")
-    try:
-        return pd.read_parquet(folder / table)
-    except (OSError, ValueError) as error:
-        raise refusal("no_data_set", str(folder / table)) from error
 
 
 def moment(text: str | None) -> datetime | None:
