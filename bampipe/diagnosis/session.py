@@ -211,10 +211,9 @@ class Session:
     def replicate_reversals(self, spec: ModelSpec, linearisation: Linearisation) -> list[Array]:
         """Return residuals of friction that reverses otherwise, by trial, each (K, n_q, 2).
 
-        The first is that of a replicate without noise whose friction truly stops. It is zero where
-        the motion is kept, or if the simulation diverges; controllers keep a robot on its path, so
-        that there only the width of the sign changes the friction. The second is that of friction
-        whose sign is wider.
+        The first is that of a replicate without noise whose friction truly stops, or zero where the
+        motion is kept or the simulation diverges. Controllers keep a robot on its path: there, only
+        the width of the sign changes the friction. The second is that of a wider sign.
         """
         stops = self._replicate_stopping(spec, linearisation)
         wider = _change_width(linearisation, _WIDER)
