@@ -72,10 +72,7 @@ def test_following_judges_the_model_that_it_starts_from(
             "between b:joint (0.70) and c:joint (0.30) beside a:joint (> 0.99): b:joint added"
             " provisionally. No trial was found",
         ),
-        (
-            {(): 0.6, ("a:joint",): 0.4},
-            "between nothing (0.60) and a:joint (0.40): none is added. No trial was found",
-        ),
+        ({(): 0.6, ("a:joint",): 0.4}, "between something unknown (0.60) and a:joint (0.40): none"),
     ],
 )
 def test_an_effect_that_is_added_undecided_is_called_provisional(
@@ -83,7 +80,8 @@ def test_an_effect_that_is_added_undecided_is_called_provisional(
 ) -> None:
     lines = {}
     for verdict in ("undecided", "missing"):
-        content = diagnosis({"joint": {"verdict": verdict}}, sets)
+        content = diagnosis({"joint": {"verdict": verdict, "unknown": 0.6}}, sets)
+        content["sets"][0] |= {"unknown": "" if content["selected"] else "joint"}
         found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
         lines[verdict] = list(loop._list_open_questions(found))
     assert lines["missing"] == []

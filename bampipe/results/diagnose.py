@@ -162,7 +162,7 @@ class DiagnoseResult(Result, file="models/{model}/diagnose.json", stage="diagnos
         """
         entry, found = self.axes[axis], dict[Names, float]()
         axis_of = {each.effect: each.axis for each in self.ranking}
-        open_question = entry.standing == "above_floor" and not entry.remains
+        open_question = entry.unknown > 0.0 and not entry.remains
         for one in self.sets:
             here = tuple(name for name in entry.likely if name in one.effects)
             here = here or tuple(name for name in one.effects if axis_of.get(name) == axis)
