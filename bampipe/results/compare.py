@@ -5,7 +5,7 @@ from typing import Literal, Self
 
 from pydantic import Field
 
-from bampipe.results.floor import FLOOR_WRONG, FloorStatus, compare_with_floor
+from bampipe.results.floor import FLOOR_WRONG, FloorStatus
 from bampipe.results.record import Names, Record, Result, Size
 from bampipe.results.validate import AxisDrift, FreeRunError
 
@@ -53,12 +53,8 @@ class Rung(Record):
 
     def has_lost_its_floor(self, other: Self) -> bool:
         """Whether its error has no floor on an axis where that of ``other`` has one."""
-        axes = other.noise_floor
-        return any(self._floor_is_wrong(a) and not other._floor_is_wrong(a) for a in axes)
-
-    def _floor_is_wrong(self, axis: str) -> bool:
-        error, floor = self.held_out_rmse.get(axis, math.nan), self.noise_floor.get(axis)
-        return compare_with_floor(error, floor) in FLOOR_WRONG
+        mine, theirs = self.standing, other.standing
+        return any(mine[a] in FLOOR_WRONG and theirs[a] not in FLOOR_WRONG for a in theirs)
 
 
 class Value(Record):

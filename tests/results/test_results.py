@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from made_results import filled
@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.results.compare import Rung
+from bampipe.results.floor import FloorStatus
 from bampipe.results.ingest import IngestResult
 from bampipe.results.validate import AxisError, ValidateResult
 
@@ -88,8 +89,8 @@ def test_what_another_version_added_is_passed_over_and_an_absent_result_is_named
 
 
 def test_a_version_far_below_its_floor_is_no_better() -> None:
-    before, near, below, without = (
-        Rung.model_construct(held_out_rmse={"joint": error}, noise_floor={"joint": floor})
-        for error, floor in ((2.7, 1.0), (1.0, 1.0), (0.1, 1.0), (0.1, None))
+    near, before, below, without = (
+        Rung.model_construct(held_out_rmse={"joint": error}, standing={"joint": word})
+        for error, word in zip((1.0, 2.7, 0.1, 0.1), get_args(FloorStatus), strict=True)
     )
     assert [r.improves_on(before) for r in (near, below, without)] == [True, False, False]

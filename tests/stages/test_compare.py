@@ -22,7 +22,8 @@ def add(root: Path, name: str, parent: str, floor: float | None = None, **errors
     effects = tuple(part.replace(".", ":") for part in name.split("+")[1:])
     write_model(root, name, *effects, parent=parent)
     write_result(root, IdentifyResult, model=name, parameters={})
-    known = {"noise_floor": floor, "unit": "N.m"}
+    standing = "at_floor" if floor else "floor_missing"
+    known = {"standing": standing, "noise_floor": floor, "unit": "N.m"}
     axes = {axis: {"held_out_rmse": error, **known} for axis, error in errors.items()}
     write_result(root, ValidateResult, model=name, axes=axes)
 
