@@ -230,7 +230,7 @@ def _list_open_questions(diagnosis: DiagnoseResult) -> Iterator[str]:
             continue
         known, parts = phrases.split_alternatives(diagnosis, axis)
         taken = join_names(name for name in entry.effects if name in open_effects)
-        added = f"{taken} added provisionally" if taken else "none is added"
+        added = f"{taken} added provisionally" if taken else "none of these is added"
         beside = f" beside {known}" if known else ""
         asked = trial is not None and {*trial.between} & {*entry.probabilities}
         advice = trial.sentence if trial is not None and asked else phrases.advise_trial(entry)
