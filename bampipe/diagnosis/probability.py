@@ -16,7 +16,7 @@ from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Pool
 from bampipe.diagnosis.session import Fit, acting_axes, change_effects
-from bampipe.diagnosis.set_cost import SetCosts, added_effects, removed_effects
+from bampipe.diagnosis.set_cost import SetCosts, added_effects, effect_names, removed_effects
 from bampipe.diagnosis.unknown import Splines, Unknown, build_splines, weigh_unknown
 
 _DRAWS = 1000
@@ -105,10 +105,17 @@ def weigh_sets(
     costs = by_noise.with_independent(fit.count_independent(criteria))
     by_fit = {pool[n][1]: one for n, one in fitted.items() if n in pool}
     none, count = costs.cost(()), float(costs.problem.independent.sum())
-    shortfall = {keys: one.shortfall * count for keys, one in by_fit.items()}
+
+    def shortfall(keys: tuple[Key, ...]) -> float:
+        """What a fit of the set, or of parts of it, falls short of its linear problem, nats."""
+        if keys in by_fit:
+            return by_fit[keys].shortfall * count
+        parts = [one.shortfall for n, one in fitted.items() if {*n} < {*effect_names(keys)}]
+        return count * max(parts, default=0.0)
+
     own = [e for e in costs.problem.absence if e not in given]
     bare = change_effects(fit.spec, own)
-    weighed = sorted((costs.cost(k) + shortfall.get(k, 0.0), k) for _, k in pool.values() if k)
+    weighed = sorted((costs.cost(k) + shortfall(k), k) for _, k in pool.values() if k)
     near = [k for cost, k in weighed[:_MOST_SETS] if cost < none + _MARGIN]
     absent = [((f"-{e}", ()),) for e in own]
 
@@ -118,7 +125,7 @@ def weigh_sets(
 
     named = [
         SetEvidence(
-            keys, list_effects(keys), None, none - costs.cost(keys) - shortfall.get(keys, 0.0),
+            keys, list_effects(keys), None, none - costs.cost(keys) - shortfall(keys),
             split_evidence(costs, keys, by_fit[keys].rows if keys in by_fit else ()),
         )
         for keys in dict.fromkeys([(), *near, *absent])

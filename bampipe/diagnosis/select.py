@@ -241,6 +241,11 @@ def _fit_better(
         moved = fits[members]
         if moved is not None:
             gain, held_out = gains_when_fitted(current, moved, search, keys)
+            if gain > _LEAST_GAIN:  # a set that averages noise of the motion gains nothing by it
+                noise = np.minimum(session.compare_noise(current, moved), 1.0)
+                share = 1.0 / np.maximum(moved.solution.left / moved.problem.count, 1.0)
+                averaged = np.log(1.0 - share * (1.0 - noise))
+                gain += 0.5 * float(search.problem.independent @ averaged)
             if gain > _LEAST_GAIN and held_out > -NOTICEABLE:
                 return moved, kept
             rows = zip(moved.rows_beyond_bias, current.likelihood.root, strict=True)

@@ -240,6 +240,36 @@ class Session:
             return nothing
         return [values[:, :, 0] for values in found]
 
+    def compare_noise(self, before: "Fit", after: "Fit") -> Array:
+        """Return the variance of sensor noise in the residual of a model over another's, (n_q,).
+
+        Both see the difference of two replicates of ``before``. An elastic coupling, for example,
+        averages the noise of an acceleration.
+        """
+        t, e, models = (
+            self.trials,
+            before.linearisation,
+            (before.linearisation, after.linearisation),
+        )
+        simulated = SimulatedTrials(e.system, e.p, e.motions, t.sensors.rate_hz)
+        rows: list[list[Array]] = [[], []]
+        for trial in range(len(e.motions)):
+            rngs = (np.random.default_rng((self.seed, _SEED, k, trial)) for k in range(2))
+            one, other = (
+                make_replicate(simulated, trial, t.sensors, t.kinematics, rng) for rng in rngs
+            )
+            for each, m in zip(rows, models, strict=True):
+                there = ModelOnTrial(m.system, m.p, [other]).residual
+                each.append(ModelOnTrial(m.system, m.p, [one]).residual - there)
+        thin = [e.band.thin_trials(each, range(len(e.system.coordinates))) for each in rows]
+        old, new = np.transpose([
+            [np.sum((take_samples(each, here, axis) * root) ** 2) for each in thin]
+            for axis, (here, root) in enumerate(
+                zip(before.likelihood.samples, before.likelihood.root, strict=True)
+            )
+        ])  # fmt: skip
+        return np.asarray(np.where(old > 0.0, new / np.maximum(old, 1e-300), 1.0))
+
     def weight_samples(
         self,
         spec: ModelSpec,

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.data.refusals import refusal
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model import ModelFile, read_model_file
-from bampipe.errors import InputError
 from bampipe.progress import Progress
 from bampipe.results.compare import CompareResult, Moved, Rung, Value
 from bampipe.results.identify import IdentifyResult
@@ -41,11 +41,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         if run.exists(ValidateResult.file(name))
     }
     if not models:
-        raise InputError(
-            "no model has been validated yet",
-            where=str(run.root),
-            remedy=f"run `bampipe validate {run.root}` first",
-        )
+        raise refusal("none_validated", str(run.root), root=run.root)
     order = sorted(models, key=lambda n: (len(models[n].effects), n))
     ladder: dict[str, Rung] = {}
     parameters: dict[str, dict[str, Value]] = {}

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.data.refusals import refusal
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_spec
@@ -20,7 +21,7 @@ from bampipe.diagnosis.select import Selection, select_effects
 from bampipe.diagnosis.session import Session
 from bampipe.diagnosis.shape import residual_map, variables, worst_windows
 from bampipe.diagnosis.verdict import conclude
-from bampipe.errors import InputError, NothingToDoError, did_you_mean
+from bampipe.errors import NothingToDoError, did_you_mean
 from bampipe.estimate.simulation import Runaway
 from bampipe.next_trial.suggestion import suggest_trial
 from bampipe.phrases import diagnosis as phrases
@@ -75,30 +76,17 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """
     setup = None if config.trust_setup else run.find(SetupResult)
     if setup is not None and setup.mistakes:
-        raise InputError(
-            f"no effect is looked for, since the set-up is wrong: {setup.mistakes[0].sentence}"
-            f" ({setup.mistakes[0].evidence})",
-            where=str(run.path(SetupResult.FILE)),
-            remedy="correct the session file and run it again, or --set trust_setup=true",
-        )
+        raise refusal("wrong_set_up", str(run.path(SetupResult.FILE)), first=setup.mistakes[0])
     model = load_model(run, config.model)
     system = compile_model(model)
     if system.undriven:
-        raise InputError(
-            f"no force acts on {system.undriven[0]}, so its equation has no measured side, and any"
-            " effect that shrinks all terms would seem to explain it",
-            where=f"device {model.device.name!r}",
-            remedy="judge its models by validate and compare",
-        )
+        where = f"device {model.device.name!r}"
+        raise refusal("no_measured_side", where, axis=system.undriven[0])
     timing = run.read(IdentifyResult, config.model).input_timing
     trials = read_measured_trials(run, system, every_input=True, timing=timing)
     fitted = sum(group != HELD_OUT for group in trials.folds.groups)
     if fitted < 2:
-        raise InputError(
-            f"a diagnosis needs at least two moving trials, found {fitted}",
-            where=str(run.root),
-            remedy="one trial is held out to judge the others; record more free trials",
-        )
+        raise refusal("too_few_moving", str(run.root), found=fitted)
     trials = replace(trials, motions=tuple(trials.motions))
     spec = read_spec(run, config.model, model)
     for setting in ("without", "also"):
@@ -131,11 +119,8 @@ def _require_known(names: Sequence[str], spec: ModelSpec, setting: str) -> None:
     known = list_candidates(spec.model().device, (), extra, on_request=True)
     for name in names:
         if name not in known:
-            raise InputError(
-                f"this device has no effect {name!r}{did_you_mean(name, known)}",
-                where=f"diagnose.{setting}",
-                remedy="`bampipe effects` lists them",
-            )
+            near = did_you_mean(name, known)
+            raise refusal("no_such_effect", f"diagnose.{setting}", name=name, near=near)
 
 
 def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:

@@ -13,6 +13,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import Array, Flags
+from bampipe.data.refusals import refusal
 from bampipe.data.run_folder import FILTERED, INGESTED, MOVING, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
@@ -197,26 +198,12 @@ def _nothing_to_differentiate(
     """Say why no trial can be differentiated: none has the right kind, or all are short."""
     if refused:
         name, reason = next(iter(refused.items()))
-        return InputError(
-            f"none of the {len(refused)} free and viscous trials is long enough: {name} has"
-            f" {reason}",
-            where=str(run.root),
-            remedy="record longer trials, or at a higher rate",
-        )
+        of = {"count": len(refused), "name": name, "reason": reason}
+        return refusal("all_too_short", str(run.root), **of)
     moving = trials[trials["kind"].isin(MOVING)]
     if len(moving):
-        first = moving.iloc[0]
-        return InputError(
-            f"every free and viscous trial is set aside, such as {first['trial_id']}:"
-            f" {first['reason']}",
-            where=str(run.root),
-            remedy="the others are in the report, and in ingest/trials.parquet",
-        )
-    return InputError(
-        f"no free or viscous trial among {len(trials)}: nothing to identify from",
-        where=str(run.root),
-        remedy='record trials in which the machine moves, kind = "free" in session.toml',
-    )
+        return refusal("all_set_aside", str(run.root), first=moving.iloc[0])
+    return refusal("none_moves", str(run.root), count=len(trials))
 
 
 def _write_motions(
@@ -380,11 +367,7 @@ def _choose(
     }
     fits = {k: found for k, found in fits.items() if np.isfinite(found[1])}
     if not fits:
-        raise InputError(
-            f"no filter can follow the motion of {axis}",
-            where=f"encoders.{axis}",
-            remedy="check that this is the column of its position, in the right unit",
-        )
+        raise refusal("not_followed", f"encoders.{axis}", axis=axis)
     order = max(fits, key=lambda k: fits[k][1])
     best, _ = fits[order]
     least = min(config.minimum_bandwidth_hz, most)
@@ -392,10 +375,7 @@ def _choose(
     found = best.bandwidth_hz
     cutoff = config.cutoff_hz or float(np.clip(found, least, most))
     if cutoff >= 0.5 * rate:
-        raise InputError(
-            f"{cutoff:g} Hz is not below half the sampling rate of {rate:g} Hz",
-            where="filter.cutoff_hz",
-        )
+        raise refusal("cutoff_too_high", cutoff=cutoff, rate=rate)
     if config.cutoff_hz:
         why = "set by the user"
     elif found < least:

@@ -9,12 +9,12 @@ import numpy as np
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import Array
+from bampipe.data.refusals import refusal
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.declarations.model import read_model_file
 from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_spec
 from bampipe.diagnosis.start import SignWidth, choose_sign_width, search_start
-from bampipe.errors import InputError
 from bampipe.estimate.square_root import FilterSettings
 from bampipe.identification.bodies import base_estimates, make_possible, summarise_bases
 from bampipe.identification.calibration import (
@@ -210,11 +210,7 @@ def _fit(task: _Task, start: Array) -> tuple[SquaresFit, InputTiming | None]:
     try:
         squares = fit_squares(trials, task.spec, system, start, *how)
     except ValueError as error:
-        raise InputError(
-            f"the free trials are too short to identify from ({error})",
-            where=str(task.run.root),
-            remedy="record faster motion at a higher rate, or more of it",
-        ) from error
+        raise refusal("too_short_to_identify", str(task.run.root), why=error) from error
     require_enough(squares, str(task.run.root))
     is_late, sd, late_s = False, 0.0, 0.0
     if config.input_timing and system.has_free_delay and system.model.device.robot is not None:

@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import Array
 from bampipe.data.chain import read_tree
+from bampipe.data.refusals import refusal
 from bampipe.data.robot_tree import identifier
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_spec
@@ -170,20 +171,14 @@ def _read_case(
         require_limits(model.device, f"device {model.device.name!r}")
     system = compile_model(model)
     if system.undriven:
-        raise InputError(
-            f"no force acts on {system.undriven[0]}: its motion cannot be prescribed, so no trial"
-            " can be designed",
-            where=f"device {model.device.name!r}",
-        )
+        where = f"device {model.device.name!r}"
+        raise refusal("not_prescribed", where, axis=system.undriven[0])
     p, found = read_estimate(run, config.model, system), run.read(IdentifyResult, config.model)
     purpose, parameter = _split(config.purpose, list(found.parameters))
     diagnosed = run.find(DiagnoseResult, config.model)
     if diagnosed is None and purpose == "decision":
-        raise InputError(
-            "there is no diagnosis yet, so nothing to decide is known",
-            where=str(run.root),
-            remedy=f"run `bampipe diagnose {run.root}{run.model_option(config.model)}` first",
-        )
+        model_option = run.model_option(config.model)
+        raise refusal("no_diagnosis", str(run.root), root=run.root, option=model_option)
     progress(0.0, "information in the present trials")
     trials = read_measured_trials(run, system, every_input=True, timing=found.input_timing)
     session = Session(trials, config, config.jobs or os.cpu_count() or 1, config.seed)
@@ -202,11 +197,8 @@ def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Prog
     if asked in ("auto", "decision") and case.diagnosed is not None:
         comparison = _compare_alternatives(case, case.diagnosed)
     if asked == "decision" and comparison is None:
-        raise InputError(
-            "the diagnosis left nothing to decide",
-            where=str(case.run.path(DiagnoseResult.file(case.config.model))),
-            remedy="ask for precision, sensitivity, or a parameter by name",
-        )
+        file = case.run.path(DiagnoseResult.file(case.config.model))
+        raise refusal("nothing_to_decide", str(file))
     if asked == "auto" and comparison is None and case.diagnosed is not None:
         verdicts = {axis.verdict for axis in case.diagnosed.axes.values()}
         asked = "sensitivity" if verdicts == {"nothing_missing"} else "precision"

@@ -9,10 +9,10 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import Array
+from bampipe.data.refusals import refusal
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate
-from bampipe.errors import InputError
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
@@ -95,11 +95,7 @@ def _handle(run: RunFolder, system: System, p: Array, reach: Array, points: int)
     gain = system.input_map(grid, p=p)
     regular = np.abs(np.linalg.det(gain)) > 1e-9
     if not regular.any():
-        raise InputError(
-            "no pose of the session lets the handle move in every direction",
-            where=f"device {device.name!r}",
-            remedy="look at its forces and velocities with `bampipe device show`",
-        )
+        raise refusal("no_free_pose", f"device {device.name!r}")
     back = np.linalg.inv(gain[regular])
     swept = "m" if len(axes) == 1 else f"m{len(axes)}"
     known = system.by_name(p)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.data.refusals import refusal
 from bampipe.data.run_folder import RunFolder
-from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.progress import Progress
 from bampipe.schema import STRICT
@@ -64,11 +64,8 @@ def write_page_of_two(first: Path, second: Path) -> Path:
     results, beside = Results(first), Results(second)
     device, other = (one.session.device for one in (results, beside))
     if device != other:
-        raise InputError(
-            f"it is of device {other!r}, {first.name} of {device!r}",
-            where=str(second),
-            remedy="choose two runs of one device",
-        )
+        of = {"other": other, "first": first.name, "device": device}
+        raise refusal("two_devices", str(second), **of)
     page = first.parent / f"{first.name}_beside_{second.name}.html"
     text = explorer_page(results, f"device {device}", beside)
     write_text(page, text.replace('href="report.html"', f'href="{first.name}/report/report.html"'))

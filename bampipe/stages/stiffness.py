@@ -11,6 +11,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from scipy.stats import linregress
 
 from bampipe.arrays import Array
+from bampipe.data.refusals import refusal
 from bampipe.data.run_folder import INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
@@ -96,11 +97,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         progress(number / len(locked), str(row.trial_id))
         axis = str(row.locked_axis)
         if axis not in system.coordinates:
-            raise InputError(
-                f"the device has no axis {axis!r}",
-                where=f"trial {row.trial_id}: locked_axis",
-                remedy=f"its axes are {', '.join(system.coordinates)}",
-            )
+            of = {"name": f"axis {axis!r}", "near": "", "axes": ", ".join(system.coordinates)}
+            raise refusal("unknown_axis", f"trial {row.trial_id}: locked_axis", **of)
         result = _loops_of(samples, str(row.trial_id), axis, system, session)
         if isinstance(result, str):
             notes.append(f"{row.trial_id}: {result}")

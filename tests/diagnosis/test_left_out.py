@@ -16,9 +16,7 @@ STRIBECK = {"stribeck.yaw.force": 1.1, "stribeck.yaw.speed": 0.05}
 @pytest.mark.parametrize(
     ("values", "count"), [pytest.param({}, 4, marks=pytest.mark.long), (STRIBECK, 4), (STRIBECK, 1)]
 )
-def test_an_estimate_moves_and_errs_as_a_fit_to_the_rest(
-    values: dict[str, float], count: int
-) -> None:
+def test_an_estimate_moves_and_errs_as_a_fit_to_the_rest(values, count):
     """To first order: no part may hold most of what is known of a parameter."""
     spec = bam(["stribeck:yaw"] if values else [])
     system = system_of(spec)

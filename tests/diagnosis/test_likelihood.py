@@ -75,6 +75,15 @@ def test_replicates_are_the_same_in_other_processes(fitted):
     assert not np.array_equal(alone[0][:, :, 0], alone[0][:, :, 1])
 
 
+def test_a_model_of_less_mass_averages_noise_of_the_motion(fitted):
+    session, fit = fitted
+    e, p = fit.linearisation, fit.linearisation.p.copy()
+    p[[q.name for q in e.system.parameters].index("mass")] *= 0.5
+    lighter = replace(fit, linearisation=session.linearise(fit.spec, p, e))
+    assert session.compare_noise(fit, fit) == pytest.approx(np.ones(3))
+    assert 0.25 < session.compare_noise(fit, lighter)[2] < 0.9  # the rest is that of the force
+
+
 def test_what_a_model_may_be_wrong_by_weighs_less_where_the_force_is_large(fitted):
     _, fit = fitted
     like = fit.likelihood
@@ -109,9 +118,7 @@ def test_what_all_replicates_share_goes_to_the_factors_of_the_biases(fitted, sha
         (1.0, -1.0, (1.0, 0.0)),
     ],
 )
-def test_friction_that_truly_stops_has_a_factor_of_its_own_within_bounds(
-    fitted, common, share, found
-):
+def test_friction_that_stops_has_a_factor_within_bounds(fitted, common, share, found):
     _, fit = fitted
     noise = fit.likelihood.noise
     # Unlike anything the model's own parameters could do, and the common bias.
@@ -163,8 +170,7 @@ def test_parameters_and_strengths_stay_within_bounds_and_the_rest_moves_along(li
     assert held.cost > free.cost
     # A column beyond the model's own, whose strength would be negative, is left out.
     one = problem_of(y, base[:, :1])
-    xx, xy = (base.T @ base)[None], (base.T @ y)[None]
-    yy = np.array([y @ y])
+    xx, xy, yy = (base.T @ base)[None], (base.T @ y)[None], np.array([y @ y])
     out = solve_bounded(one, xx, xy, yy, np.array([0.0]), np.array([np.inf]))
     assert out.held.tolist() == [True] and out.unknowns[1] == 0.0
     inside = solve_bounded(one, xx, xy, yy, np.array([-3.0]), np.array([0.0]))
@@ -175,12 +181,8 @@ def test_parameters_and_strengths_stay_within_bounds_and_the_rest_moves_along(li
 def test_bounds_that_are_crossed_together_do_not_all_hold_at_the_minimum(seed):
     rng = np.random.default_rng(seed)
     base = rng.normal(size=(200, 6)) @ rng.normal(size=(6, 6))
-    y, lower, upper = (
-        rng.normal(size=200) - base @ rng.normal(size=6),
-        rng.normal(size=6) - 1.0,
-        0.5,
-    )
-    lower = np.minimum(lower, 0.0)
+    y = rng.normal(size=200) - base @ rng.normal(size=6)
+    lower, upper = np.minimum(rng.normal(size=6) - 1.0, 0.0), 0.5
     found = problem_of(y, base, lower=lower, upper=upper).solve().base
     wanted = lsq_linear(base, -y, (lower, upper)).x
     assert np.sum((y + base @ found) ** 2) < 1.001 * np.sum((y + base @ wanted) ** 2)
