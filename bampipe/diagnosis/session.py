@@ -193,17 +193,26 @@ class Session:
             Runaway: the simulated motion grows without bounds.
         """
         seeds = [(self.seed, _SEED, k) for k in range(count)]
-        return self._replicate(linearisation, linearisation.system, self.trials.sensors, seeds)
+        return self._replicate([linearisation], linearisation.system, self.trials.sensors, seeds)
 
     def _replicate(
-        self, e: Linearisation, system: System, sensors: Sensors, seeds: Sequence[Seed]
+        self,
+        models: Sequence[Linearisation],
+        system: System,
+        sensors: Sensors,
+        seeds: Sequence[Seed],
     ) -> Sequence[Array]:
+        """Return the residuals of ``models``, by seed, on replicates with parameters of the first.
+
+        They are by trial, each (K, n_q, seeds * models).
+        """
+        e = models[0]
         simulated = SimulatedTrials(system, e.p, e.motions, sensors.rate_hz)
         parts = [[seed] for seed in seeds] if self.jobs > 1 else [seeds]
         # Workers inherit the course of the machine, which all replicates share.
         trials = range(min(len(simulated.courses), len(simulated.rests)))
         tasks = [(trial, part) for trial in trials for part in parts]
-        state = e, simulated, sensors, self.trials.kinematics
+        state = models, simulated, sensors, self.trials.kinematics
         with workers(state, min(self.jobs, len(tasks))) as spread:
             found = spread(_replicate_trial, tasks)
             return KeptItems(np.concatenate([next(found) for _ in parts], axis=2) for _ in trials)
@@ -235,7 +244,7 @@ class Session:
             t.sensors, resolution=none, reading_sd=none, force_sd=np.zeros_like(t.sensors.force_sd)
         )
         try:
-            found = self._replicate(linearisation, narrow, exact, [(self.seed,)])
+            found = self._replicate([linearisation], narrow, exact, [(self.seed,)])
         except Runaway:
             return nothing
         return [values[:, :, 0] for values in found]
@@ -246,28 +255,14 @@ class Session:
         Both see the difference of two replicates of ``before``. An elastic coupling, for example,
         averages the noise of an acceleration.
         """
-        t, e, models = (
-            self.trials,
-            before.linearisation,
-            (before.linearisation, after.linearisation),
-        )
-        simulated = SimulatedTrials(e.system, e.p, e.motions, t.sensors.rate_hz)
-        rows: list[list[Array]] = [[], []]
-        for trial in range(len(e.motions)):
-            rngs = (np.random.default_rng((self.seed, _SEED, k, trial)) for k in range(2))
-            one, other = (
-                make_replicate(simulated, trial, t.sensors, t.kinematics, rng) for rng in rngs
-            )
-            for each, m in zip(rows, models, strict=True):
-                there = ModelOnTrial(m.system, m.p, [other]).residual
-                each.append(ModelOnTrial(m.system, m.p, [one]).residual - there)
-        thin = [e.band.thin_trials(each, range(len(e.system.coordinates))) for each in rows]
-        old, new = np.transpose([
-            [np.sum((take_samples(each, here, axis) * root) ** 2) for each in thin]
-            for axis, (here, root) in enumerate(
-                zip(before.likelihood.samples, before.likelihood.root, strict=True)
-            )
-        ])  # fmt: skip
+        e, seeds = before.linearisation, [(self.seed, _SEED, k) for k in range(2)]
+        models = e, after.linearisation
+        rows = self._replicate(models, e.system, self.trials.sensors, seeds)
+        squares = []
+        for axis, here in enumerate(before.likelihood.samples):
+            seen = take_samples(rows, here, axis) * before.likelihood.root[axis][:, None]
+            squares.append(np.sum((seen[:, :2] - seen[:, 2:]) ** 2, axis=0))
+        old, new = np.transpose(squares)
         return np.asarray(np.where(old > 0.0, new / np.maximum(old, 1e-300), 1.0))
 
     def weight_samples(
@@ -560,13 +555,13 @@ def rms(values: Array) -> float:
 
 
 def _replicate_trial(task: tuple[int, Sequence[Seed]]) -> Array:
-    """Return the residuals of replicates of one trial, one per seed, (K, n_q, seeds)."""
-    (e, simulated, sensors, kinematics), (trial, seeds) = worker_state(), task
-    rows = []
+    """Return the residuals of models on replicates of one trial, (K, n_q, seeds * models)."""
+    (models, simulated, sensors, kinematics), (trial, seeds) = worker_state(), task
+    e, rows = models[0], []
     for seed in seeds:
         rng = np.random.default_rng([*seed, trial])
         motion = make_replicate(simulated, trial, sensors, kinematics, rng)
-        rows.append(ModelOnTrial(e.system, e.p, [motion]).residual)
+        rows += [ModelOnTrial(m.system, m.p, [motion]).residual for m in models]
     thin = e.band.thin_trials(rows, range(len(e.system.coordinates)))
     return np.stack([values * e.used[trial] for values in thin], axis=2)
 

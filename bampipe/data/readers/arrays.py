@@ -263,6 +263,8 @@ def _at_one_rate(arrays: Arrays) -> Arrays:
 
     Of groups that each have a time, and one signal or others than the rest; else they are trials.
     """
+    if sum(map(bool, map(_CLOCK.match, arrays))) < 2:  # nothing is loaded to compare them
+        return arrays
     groups: dict[str, dict[str, str]] = {}
     for name, array in arrays.items():
         owner, dot, key = name.rpartition("/" if "/" in name else ".")
